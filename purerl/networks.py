@@ -1,0 +1,177 @@
+"""Policy and value networks: the default MLP, recurrent ones, and an adapter for any Flax module.
+
+`ppo.py` knows only `Network(init, apply)`; this is the one module that imports a network library.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from purerl.types import Array, Network, Normal, PolicyOutput, PyTree
+
+ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
+    "elu": nn.elu,
+    "relu": nn.relu,
+    "swish": nn.swish,
+    "tanh": nn.tanh,
+}
+MIN_SCALE = 1e-3  # a policy of scale 0 has an infinite density
+
+
+@dataclass(frozen=True)
+class MlpOptions:
+    """Sizes of the default feed-forward network."""
+
+    policy_hidden: tuple[int, ...] = (128, 128)
+    """Widths of the policy's hidden layers."""
+    value_hidden: tuple[int, ...] = (256, 256)
+    """Widths of the value function's hidden layers."""
+    activation: Literal["elu", "relu", "swish", "tanh"] = "swish"
+    """Nonlinearity of the hidden layers."""
+    std: Literal["learned", "state"] = "learned"
+    """Policy scale: one learned vector, or a function of the observation."""
+    initial_std: float = 0.6
+    """Policy scale before training, in raw-action units."""
+
+
+@dataclass(frozen=True)
+class RecurrentOptions:
+    """Sizes of the recurrent network."""
+
+    cell: Literal["gru", "lstm"] = "gru"
+    """Kind of recurrent cell."""
+    hidden: int = 128
+    """Features of the cell's memory."""
+    encoder: tuple[int, ...] = (128,)
+    """Widths of the layers before the cell."""
+    value_hidden: tuple[int, ...] = (128,)
+    """Widths of the value function's hidden layers, after the cell."""
+    activation: Literal["elu", "relu", "swish", "tanh"] = "swish"
+    """Nonlinearity of the feed-forward layers."""
+    std: Literal["learned", "state"] = "learned"
+    """Policy scale: one learned vector, or a function of the observation."""
+    initial_std: float = 0.6
+    """Policy scale before training, in raw-action units."""
+
+
+def policy_features(observation: PyTree) -> Array:
+    """Returns what the policy may read, [..., O]: the array, or the entry "policy" of a dict."""
+    return observation["policy"] if isinstance(observation, dict) else observation
+
+
+def value_features(observation: PyTree) -> Array:
+    """Returns what the value function may read, [..., O]: every entry of a dict, in name order."""
+    if not isinstance(observation, dict):
+        return observation
+    return jnp.concatenate([observation[name] for name in sorted(observation)], axis=-1)
+
+
+def _inverse_softplus(x: float) -> float:
+    return math.log(math.expm1(x))
+
+
+class Stack(nn.Module):
+    """Dense layers with an activation after each."""
+
+    widths: tuple[int, ...]
+    activation: str
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        for width in self.widths:
+            x = ACTIVATIONS[self.activation](nn.Dense(width)(x))
+        return x
+
+
+class GaussianHead(nn.Module):
+    """Features [..., H] to a Gaussian over raw actions [..., A]; starts near mean 0."""
+
+    action_size: int
+    std: str
+    initial_std: float
+
+    @nn.compact
+    def __call__(self, x: Array) -> Normal:
+        # Nearly zero weights: the first policy explores alike everywhere.
+        small = nn.initializers.variance_scaling(1e-4, "fan_in", "truncated_normal")
+        loc = nn.Dense(self.action_size, kernel_init=small, name="loc")(x)
+        if self.std == "state":
+            raw = nn.Dense(self.action_size, kernel_init=small, name="scale")(x)
+        else:
+            raw = self.param("scale", nn.initializers.zeros, (self.action_size,))
+        offset = _inverse_softplus(self.initial_std)
+        scale = jax.nn.softplus(raw + offset) + MIN_SCALE
+        return Normal(loc=loc, scale=jnp.broadcast_to(scale, loc.shape))
+
+
+class MlpActorCritic(nn.Module):
+    """Separate policy and value towers: they share no weights."""
+
+    options: MlpOptions
+    action_size: int
+
+    @nn.compact
+    def __call__(self, observation: PyTree) -> PolicyOutput:
+        o = self.options
+        policy = Stack(o.policy_hidden, o.activation, name="policy")(policy_features(observation))
+        normal = GaussianHead(self.action_size, o.std, o.initial_std, name="head")(policy)
+        value = Stack(o.value_hidden, o.activation, name="value")(value_features(observation))
+        return PolicyOutput(normal, nn.Dense(1, name="value_out")(value)[..., 0])
+
+
+class RecurrentActorCritic(nn.Module):
+    """A cell over what the policy may read; the value also reads the rest of the observation."""
+
+    options: RecurrentOptions
+    action_size: int
+
+    @nn.compact
+    def __call__(self, observation: PyTree, carry: PyTree) -> tuple[PolicyOutput, PyTree]:
+        o = self.options
+        encoded = Stack(o.encoder, o.activation, name="encoder")(policy_features(observation))
+        cell = {"gru": nn.GRUCell, "lstm": nn.OptimizedLSTMCell}[o.cell](o.hidden, name="cell")
+        carry, memory = cell(carry, encoded)
+        normal = GaussianHead(self.action_size, o.std, o.initial_std, name="head")(memory)
+        features = jnp.concatenate([memory, value_features(observation)], axis=-1)
+        value = Stack(o.value_hidden, o.activation, name="value")(features)
+        return PolicyOutput(normal, nn.Dense(1, name="value_out")(value)[..., 0]), carry
+
+
+def from_linen(module: nn.Module, observation: PyTree, carry: PyTree = ()) -> Network:
+    """Adapts a Flax module to `Network`.
+
+    Args:
+      module: `module(observation) -> PolicyOutput`, or, with a carry,
+        `module(observation, carry) -> (PolicyOutput, carry)`. Leading axes are batch axes.
+      observation: an example of one observation, leaves [O] (shapes only matter).
+      carry: one environment's memory at the start of an episode, leaves [H], all zeros.
+    """
+    recurrent = len(jax.tree.leaves(carry)) > 0
+    arguments = (observation, carry) if recurrent else (observation,)
+
+    def init(key: Array) -> tuple[PyTree, PyTree]:
+        return module.init(key, *arguments), carry
+
+    def apply(params: PyTree, observation: PyTree, carry: PyTree) -> tuple[PolicyOutput, PyTree]:
+        if recurrent:
+            return module.apply(params, observation, carry)  # type: ignore[return-value]
+        return module.apply(params, observation), carry  # type: ignore[return-value]
+
+    return Network(init=init, apply=apply)
+
+
+def mlp(options: MlpOptions, observation: PyTree, action_size: int) -> Network:
+    """Builds the default network for one `observation` (leaves [O]) and `action_size` A."""
+    return from_linen(MlpActorCritic(options, action_size), observation)
+
+
+def recurrent(options: RecurrentOptions, observation: PyTree, action_size: int) -> Network:
+    """Builds the GRU or LSTM network for one `observation` (leaves [O]) and `action_size` A."""
+    memory = jnp.zeros(options.hidden)
+    carry = memory if options.cell == "gru" else (memory, memory)
+    return from_linen(RecurrentActorCritic(options, action_size), observation, carry)

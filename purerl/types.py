@@ -1,0 +1,115 @@
+"""The shape alphabet and the records that several modules share.
+
+Shapes, everywhere in this project, time first (`[T, B, ...]`):
+
+| letter | axis                                   |
+|--------|----------------------------------------|
+| `T`    | control steps in one rollout           |
+| `B`    | parallel environments                  |
+| `M`    | samples in one minibatch               |
+| `O`    | observation features                   |
+| `A`    | action features                        |
+| `H`    | features of a recurrent carry          |
+| `S`    | seeds                                  |
+| `N`    | evaluation episodes                    |
+
+`[]` is a scalar, `[...]` any leading batch axes. A docstring that says `[O]` describes one
+environment; the caller's `vmap` adds `[B, O]`.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+Array = jax.Array
+PyTree = Any
+Metrics = dict[str, Array]
+
+
+class Normal(NamedTuple):
+    """Parameters of a diagonal Gaussian, before any squashing."""
+
+    loc: Array  # [..., A]
+    scale: Array  # [..., A] > 0
+
+
+class PolicyOutput(NamedTuple):
+    """What a network says about one observation."""
+
+    distribution: Normal  # over raw (unsquashed) actions [..., A]
+    value: Array  # [...] expected discounted return, in scaled-reward units
+
+
+class Network(NamedTuple):
+    """A policy and value function as a pair of pure functions.
+
+    `init(key) -> (params, carry)`: parameters, and one environment's carry at the start of an
+    episode, which must be all zeros (a feed-forward network returns `()`).
+    `apply(params, observation, carry) -> (PolicyOutput, carry)`: accepts any leading batch axes,
+    the same on `observation` and `carry`.
+    """
+
+    init: Callable[[Array], tuple[PyTree, PyTree]]
+    apply: Callable[[PyTree, PyTree, PyTree], tuple[PolicyOutput, PyTree]]
+
+
+class Counter(struct.PyTreeNode):
+    """A 64-bit count on devices without 64-bit integers: `high * 2**32 + low`."""
+
+    high: Array  # [] uint32
+    low: Array  # [] uint32
+
+
+def zero_count() -> Counter:
+    """Returns a counter at 0."""
+    return Counter(high=jnp.zeros((), jnp.uint32), low=jnp.zeros((), jnp.uint32))
+
+
+def add_count(count: Counter, number: Array) -> Counter:
+    """Adds `number` ([] integer, at least 0, below 2**32) exactly."""
+    low = count.low + number.astype(jnp.uint32)
+    carry = (low < count.low).astype(jnp.uint32)
+    return Counter(high=count.high + carry, low=low)
+
+
+def count_as_float(count: Counter) -> Array:
+    """Returns the count rounded to float32 ([]): exact below 2**24, 6e-8 relative above."""
+    return count.high.astype(jnp.float32) * 2.0**32 + count.low.astype(jnp.float32)
+
+
+def count_as_int(count: Counter) -> int:
+    """Returns the exact count as a Python integer (host only)."""
+    return (int(count.high) << 32) + int(count.low)
+
+
+class EpisodeStats(struct.PyTreeNode):
+    """Running statistics of each environment's current episode."""
+
+    episode_return: Array  # [B] undiscounted, unscaled sum of rewards
+    length: Array  # [B] int32 control steps so far
+    limit: Array  # [B] int32 time limit; the first episodes' are staggered
+    metrics: dict[str, Array]  # name -> [B] sums of the environment's metrics
+
+
+class TrainState(struct.PyTreeNode):
+    """Everything a run is: `update(state) -> (state, metrics)`, and a checkpoint is this record."""
+
+    # What is learned.
+    params: PyTree
+    optimizer: PyTree
+    learning_rate: Array  # [] float32; moves only under the adaptive-KL schedule
+    normalizer: PyTree  # normalizer.Statistics of the observation
+    reward_normalizer: PyTree  # normalizer.Statistics of the discounted return, [] each
+    # Where the environments are.
+    env: PyTree  # env.State, [B, ...]
+    carry: PyTree  # the policy's memory, [B, ...]; () for a feed-forward network
+    episode: EpisodeStats  # [B]
+    discounted_return: Array  # [B] running return, for reward scaling
+    # Bookkeeping.
+    key: Array  # [] typed key of the run's seed; never advanced, only folded into
+    update: Array  # [] int32 updates done
+    steps: Counter  # control steps taken, all environments together
+    skipped_in_a_row: Array  # [] int32 non-finite minibatch updates since the last good one
