@@ -1,0 +1,230 @@
+"""MuJoCo behind one small stateless interface, whatever the engine."""
+
+import difflib
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+
+from purerl.types import Array
+
+ENGINES = ("auto", "c", "jax", "warp")
+
+_POSITION = ("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos")
+_POSITION += ("geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat", "subtree_com")
+_POSITION += ("cinert", "crb", "cdof", "ten_length", "actuator_length")
+_VELOCITY = ("cvel", "cdof_dot", "ten_velocity", "actuator_velocity", "qfrc_bias")
+_VELOCITY += ("qfrc_passive", "subtree_linvel", "subtree_angmom")
+_ACCELERATION = ("qacc", "act_dot", "actuator_force", "qfrc_actuator", "qfrc_smooth")
+_ACCELERATION += ("qacc_smooth", "qfrc_constraint", "cacc", "cfrc_int", "cfrc_ext")
+READINGS = (*_POSITION, *_VELOCITY, *_ACCELERATION, "sensordata")
+
+_S = mujoco.mjtSensor
+# Fields that MuJoCo computes only for the sake of a sensor: without one they hold old values.
+_FOR_BODY_FORCES = (_S.mjSENS_ACCELEROMETER, _S.mjSENS_FORCE, _S.mjSENS_TORQUE)
+_FOR_BODY_FORCES += (_S.mjSENS_FRAMELINACC, _S.mjSENS_FRAMEANGACC)
+_FOR_SUBTREE = (_S.mjSENS_SUBTREELINVEL, _S.mjSENS_SUBTREEANGMOM)
+_NEEDS_SENSOR = dict.fromkeys(("cacc", "cfrc_int", "cfrc_ext"), _FOR_BODY_FORCES)
+_NEEDS_SENSOR |= dict.fromkeys(("subtree_linvel", "subtree_angmom"), _FOR_SUBTREE)
+
+
+class PhysicsState(struct.PyTreeNode):
+    """The integration state of one simulation: all it needs to go on, and no more.
+
+    float32 on every engine. MuJoCo's C code computes in float64, and rounds its state at each
+    control step on purpose: what goes on is what a checkpoint holds and what another engine sees.
+    """
+
+    qpos: Array  # [nq] positions [m or rad; quaternions]
+    qvel: Array  # [nv] velocities [m/s or rad/s]
+    act: Array  # [na] actuator activations
+    time: Array  # [] simulated time [s]
+    qacc_warmstart: Array  # [nv] solver's starting point; without it a resumed run differs
+    mocap_pos: Array  # [nmocap, 3] [m]
+    mocap_quat: Array  # [nmocap, 4]
+
+
+class Physics:
+    """One `mujoco.MjModel` on one engine.
+
+    `init` and `step` describe ONE simulation and are pure under jit, vmap, nested vmap and scan.
+
+    Readings are a NamedTuple with the fields asked for at construction, float32, of the same
+    shapes on every engine. As in dm_control, position- and velocity-dependent readings (and
+    sensors) are current, that is, of the state returned; acceleration-dependent ones
+    (`actuator_force`, `qfrc_actuator`, `cfrc_ext`, accelerometers, touch, ...) are those of the last
+    substep, which led to that state.
+
+    `changes` maps MjModel field names to this simulation's values, of the field's own shape
+    (`{"geom_friction": [ngeom, 3]}`). Fields are set as they are: constants that the model compiler
+    derives from them (`body_invweight0`, `body_subtreemass`, ... of `mj_setConst`) do not follow, on
+    any engine; change those beside them where it matters.
+
+    A simulation that blows up, or is given NaN, returns NaN and touches no other.
+    """
+
+    model: mujoco.MjModel
+    engine: str  # "c" or "jax"
+    substeps: int
+    control_timestep: float  # substeps * model.opt.timestep [s]
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        readings: tuple[str, ...] = (),
+        substeps: int = 5,
+        engine: str = "auto",
+    ):
+        """Prepares the model for an engine.
+
+        Args:
+          model: the compiled model.
+          readings: names of derived `mujoco.MjData` fields, of `READINGS`.
+          substeps: physics steps in one control step.
+          engine: "c" (MuJoCo on the CPU), "jax" (MJX), or "auto": "c" where JAX runs on a CPU.
+
+        Raises:
+          ValueError: an unknown engine or reading, or a model with state that is not carried.
+        """
+        _check_model(model, readings)
+        if substeps < 1:
+            raise ValueError(f"substeps is {substeps}: a control step needs at least 1.")
+        self.model, self.substeps = model, substeps
+        self.engine = choose_engine(engine)
+        self.control_timestep = substeps * float(model.opt.timestep)
+        record = NamedTuple("Readings", [(name, Array) for name in readings])
+        self._engine = _build_engine(self.engine, model, record, substeps)
+
+    def init(
+        self, qpos: Array, qvel: Array, changes: dict[str, Array] | None = None
+    ) -> tuple[PhysicsState, Any]:
+        """Starts a simulation at qpos [nq], qvel [nv], with no activation and no control."""
+        model, changes = self.model, self._check_changes(changes)
+        _check_shape("qpos", qpos, (model.nq,))
+        _check_shape("qvel", qvel, (model.nv,))
+        mocap = [int(np.flatnonzero(model.body_mocapid == i)[0]) for i in range(model.nmocap)]
+        state = PhysicsState(
+            qpos=_float32(qpos),
+            qvel=_float32(qvel),
+            act=jnp.zeros(model.na, jnp.float32),
+            time=jnp.zeros((), jnp.float32),
+            qacc_warmstart=jnp.zeros(model.nv, jnp.float32),
+            mocap_pos=_float32(model.body_pos[mocap].reshape(-1, 3)),
+            mocap_quat=_float32(model.body_quat[mocap].reshape(-1, 4)),
+        )
+        return state, self._engine.init(state, changes)
+
+    def step(
+        self, state: PhysicsState, ctrl: Array, changes: dict[str, Array] | None = None
+    ) -> tuple[PhysicsState, Any]:
+        """Advances one control step (`substeps` physics steps) under ctrl [nu]."""
+        _check_shape("ctrl", ctrl, (self.model.nu,))
+        return self._engine.step(state, _float32(ctrl), self._check_changes(changes))
+
+    def _check_changes(self, changes: dict[str, Array] | None) -> dict[str, Array]:
+        for name, value in (changes or {}).items():
+            if name not in changeable_fields():
+                raise ValueError(_unknown("model field that can change", name, changeable_fields()))
+            _check_shape(f"changes[{name!r}]", value, getattr(self.model, name).shape)
+        return {name: _float32(value) for name, value in (changes or {}).items()}
+
+
+def choose_engine(engine: str) -> str:
+    """Resolves "auto" and refuses what cannot run here."""
+    if engine not in ENGINES:
+        raise ValueError(_unknown("engine", engine, ENGINES))
+    if engine == "warp":
+        raise ValueError(
+            "engine 'warp' (MJX-Warp) cannot run here: it needs an NVIDIA GPU and the warp-lang "
+            "package, and purerl does not drive it yet. Use 'jax' on a GPU, 'c' on a CPU."
+        )
+    if engine == "auto":
+        return "c" if jax.default_backend() == "cpu" else "jax"
+    return engine
+
+
+def _build_engine(engine: str, model: mujoco.MjModel, record: type, substeps: int) -> Any:
+    """Imports only the engine asked for: MJX alone takes seconds to import."""
+    if engine == "c":
+        from purerl.engine_c import CEngine
+
+        return CEngine(model, record, _stage(model, record._fields), substeps)
+    from purerl.engine_jax import JaxEngine
+
+    late = tuple(n for n in record._fields if n in _ACCELERATION or n == "sensordata")
+    return JaxEngine(model, record, late, substeps)
+
+
+def _stage(model: mujoco.MjModel, readings: tuple[str, ...]) -> int:
+    """The least `mujoco.mjtStage` that makes the readings current at the new state."""
+    stage = int(mujoco.mjtStage.mjSTAGE_NONE)
+    if any(name in _POSITION for name in readings):
+        stage = int(mujoco.mjtStage.mjSTAGE_POS)
+    if any(name in _VELOCITY for name in readings):
+        stage = int(mujoco.mjtStage.mjSTAGE_VEL)
+    early = model.sensor_needstage[model.sensor_needstage <= int(mujoco.mjtStage.mjSTAGE_VEL)]
+    sensors = int(early.max()) if "sensordata" in readings and early.size else 0
+    return max(stage, sensors)
+
+
+@functools.cache
+def changeable_fields() -> tuple[str, ...]:
+    """Returns the MjModel fields that may differ between environments, on every engine."""
+    from mujoco.batch import MODEL_FIELDS
+    from mujoco.mjx._src.types import Model
+
+    floats = {name for name, kind in Model.__annotations__.items() if kind is jax.Array}
+    integers = ("geom_matid", "light_type", "light_active", "light_castshadow", "mat_texid")
+    return tuple(sorted((floats & set(MODEL_FIELDS)) - set(integers)))
+
+
+def _check_model(model: mujoco.MjModel, readings: tuple[str, ...]) -> None:
+    """Raises unless everything the model and the readings need is carried between steps."""
+    held = {
+        "plugin state (npluginstate)": model.npluginstate,
+        "control or sensor delays (nhistory)": model.nhistory,
+        "sleeping bodies (mjENBL_SLEEP)": model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP,
+    }
+    for what, amount in held.items():
+        if amount:
+            raise ValueError(
+                f"The model has {what}, which purerl does not carry between control steps, so a "
+                "resumed run would differ. Remove it from the model."
+            )
+    for name in readings:
+        if name not in READINGS:
+            raise ValueError(_unknown("reading", name, READINGS))
+        needed = _NEEDS_SENSOR.get(name)
+        if needed and not np.isin(model.sensor_type, [int(s) for s in needed]).any():
+            kinds = ", ".join(s.name.removeprefix("mjSENS_").lower() for s in needed)
+            raise ValueError(
+                f"MuJoCo computes {name!r} only for a model with a sensor that needs it: add one "
+                f"of {kinds}."
+            )
+    off = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR
+    if off and any(n == "sensordata" or n in _NEEDS_SENSOR for n in readings):
+        raise ValueError("A reading needs sensors, and the model has them disabled: enable them.")
+
+
+def _float32(value: Any) -> Array:
+    return jnp.asarray(value, jnp.float32)
+
+
+def _check_shape(name: str, value: Any, shape: tuple[int, ...]) -> None:
+    if jnp.shape(value) != shape:
+        raise ValueError(
+            f"{name} has shape {jnp.shape(value)}; one simulation of this model takes {shape}. "
+            "Batches are the caller's vmap."
+        )
+
+
+def _unknown(kind: str, name: str, valid: Any) -> str:
+    """The message for a name that is not there: the nearest match, and all there are."""
+    valid = [v for v in valid if v]
+    near = difflib.get_close_matches(str(name), valid, n=1)
+    hint = f" Did you mean {near[0]!r}?" if near else ""
+    return f"There is no {kind} {name!r}.{hint} There are: {', '.join(valid) or 'none'}."
