@@ -258,9 +258,9 @@ def _ordered_scatter(eqn: core.JaxprEqn, inputs: list, known: list[Known]) -> Ar
     operand, _, updates = inputs
     if known[1] is None or "add" not in eqn.primitive.name:
         raise RuntimeError(
-            f"A {eqn.primitive.name} traced at {_source(eqn)} has indices that are known only while running, so "
-            "its sum has no fixed order on a GPU. Ask for fewer readings, or change the model so "
-            "that MJX does not need it."
+            f"A {eqn.primitive.name} traced at {_source(eqn)} has indices that are known "
+            "only while running, so its sum has no fixed order on a GPU. Ask for fewer readings, "
+            "or change the model so that MJX does not need it."
         )
     order = _order_of_sums(_addresses(eqn, known[1]()), operand.size)
     total, flat = jnp.reshape(operand, (-1,)), jnp.reshape(updates, (-1,))

@@ -1,6 +1,5 @@
 """MuJoCo behind one small stateless interface, whatever the engine."""
 
-import difflib
 import functools
 from typing import Any, NamedTuple
 
@@ -10,6 +9,7 @@ import mujoco
 import numpy as np
 from flax import struct
 
+from purerl.model import unknown_name
 from purerl.types import Array
 
 ENGINES = ("auto", "c", "jax", "warp")
@@ -56,13 +56,13 @@ class Physics:
     Readings are a NamedTuple with the fields asked for at construction, float32, of the same
     shapes on every engine. As in dm_control, position- and velocity-dependent readings (and
     sensors) are current, that is, of the state returned; acceleration-dependent ones
-    (`actuator_force`, `qfrc_actuator`, `cfrc_ext`, accelerometers, touch, ...) are those of the last
-    substep, which led to that state.
+    (`actuator_force`, `qfrc_actuator`, `cfrc_ext`, accelerometers, touch, ...) are those of the
+    last substep, which led to that state.
 
     `changes` maps MjModel field names to this simulation's values, of the field's own shape
-    (`{"geom_friction": [ngeom, 3]}`). Fields are set as they are: constants that the model compiler
-    derives from them (`body_invweight0`, `body_subtreemass`, ... of `mj_setConst`) do not follow, on
-    any engine; change those beside them where it matters.
+    (`{"geom_friction": [ngeom, 3]}`). Fields are set as they are: constants that the model
+    compiler derives from them (`body_invweight0`, `body_subtreemass`, ... of `mj_setConst`) do not
+    follow, on any engine; change those beside them where it matters.
 
     A simulation that blows up, or is given NaN, returns NaN and touches no other.
     """
@@ -127,8 +127,9 @@ class Physics:
 
     def _check_changes(self, changes: dict[str, Array] | None) -> dict[str, Array]:
         for name, value in (changes or {}).items():
-            if name not in changeable_fields():
-                raise ValueError(_unknown("model field that can change", name, changeable_fields()))
+            valid = changeable_fields()
+            if name not in valid:
+                raise ValueError(unknown_name("model field that can change", name, valid))
             _check_shape(f"changes[{name!r}]", value, getattr(self.model, name).shape)
         return {name: _float32(value) for name, value in (changes or {}).items()}
 
@@ -136,7 +137,7 @@ class Physics:
 def choose_engine(engine: str) -> str:
     """Resolves "auto" and refuses what cannot run here."""
     if engine not in ENGINES:
-        raise ValueError(_unknown("engine", engine, ENGINES))
+        raise ValueError(unknown_name("engine", engine, ENGINES))
     if engine == "warp":
         raise ValueError(
             "engine 'warp' (MJX-Warp) cannot run here: it needs an NVIDIA GPU and the warp-lang "
@@ -197,7 +198,7 @@ def _check_model(model: mujoco.MjModel, readings: tuple[str, ...]) -> None:
             )
     for name in readings:
         if name not in READINGS:
-            raise ValueError(_unknown("reading", name, READINGS))
+            raise ValueError(unknown_name("reading", name, READINGS))
         needed = _NEEDS_SENSOR.get(name)
         if needed and not np.isin(model.sensor_type, [int(s) for s in needed]).any():
             kinds = ", ".join(s.name.removeprefix("mjSENS_").lower() for s in needed)
@@ -220,11 +221,3 @@ def _check_shape(name: str, value: Any, shape: tuple[int, ...]) -> None:
             f"{name} has shape {jnp.shape(value)}; one simulation of this model takes {shape}. "
             "Batches are the caller's vmap."
         )
-
-
-def _unknown(kind: str, name: str, valid: Any) -> str:
-    """The message for a name that is not there: the nearest match, and all there are."""
-    valid = [v for v in valid if v]
-    near = difflib.get_close_matches(str(name), valid, n=1)
-    hint = f" Did you mean {near[0]!r}?" if near else ""
-    return f"There is no {kind} {name!r}.{hint} There are: {', '.join(valid) or 'none'}."
