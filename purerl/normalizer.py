@@ -48,10 +48,16 @@ def normalize(statistics: Statistics, features: PyTree) -> PyTree:
     """Returns (features - mean) / std, clipped to +-10; any leading axes, leaves [..., O]."""
 
     def one(x: Array, mean: Compensated, variance: Compensated) -> Array:
-        scaled = (x - mean.value) * jax.lax.rsqrt(variance.value + VARIANCE_FLOOR)
+        factor = jax.lax.rsqrt(variance.value + VARIANCE_FLOOR)
+        scaled = (x - _like(mean.value, x)) * _like(factor, x)
         return jnp.clip(scaled, -CLIP, CLIP)
 
     return jax.tree.map(one, features, statistics.mean, statistics.variance)
+
+
+def _like(feature: Array, x: Array) -> Array:
+    """Returns `feature` [O] with leading axes of size 1 to match `x` [..., O]."""
+    return jnp.expand_dims(feature, tuple(range(x.ndim - feature.ndim)))
 
 
 def update(statistics: Statistics, batch: PyTree, valid: Array) -> Statistics:
@@ -78,9 +84,9 @@ def _merge(
     mask = jnp.expand_dims(valid, tuple(range(valid.ndim, x.ndim)))
     number = jnp.maximum(valid.sum(dtype=jnp.float32), 1.0)
     # Deviations from the old mean, so that a large offset does not cost precision.
-    deviation = jnp.where(mask, x - mean.value, 0.0)
+    deviation = jnp.where(mask, x - _like(mean.value, x), 0.0)
     delta = deviation.sum(axes) / number
-    spread = jnp.where(mask, jnp.square(deviation - delta), 0.0).sum(axes) / number
+    spread = jnp.where(mask, jnp.square(deviation - _like(delta, x)), 0.0).sum(axes) / number
     increment = share * (spread - variance.value) + share * (1.0 - share) * jnp.square(delta)
     return _add(mean, share * delta), _add(variance, increment)
 

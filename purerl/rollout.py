@@ -89,7 +89,7 @@ def act(
 
 def episode_metric(name: str, total: Array, length: Array) -> Array:
     """Returns an episode's metric from its sum: the mean per step, or the sum for `*_count`."""
-    return total if name.endswith("_count") else total / jnp.maximum(length, 1)
+    return total if name.endswith("_count") else total / jnp.maximum(length, 1).astype(jnp.float32)
 
 
 def start_episodes(state: State, limit: Array) -> EpisodeStats:
@@ -166,10 +166,11 @@ def truncation_values(
 def draw_pool(config: Config, env: Env, key: Array, update: Array) -> State:
     """Draws this update's fresh starts, [R, B, ...]: R for each environment."""
     keys = per_environment(derive(key, Purpose.RESET, update), config.num_envs)
-    starts = jax.vmap(jax.random.fold_in, in_axes=(None, 0))
-    numbers = jnp.arange(config.resets_per_update)
-    keys = jax.vmap(starts, in_axes=(0, None), out_axes=1)(keys, numbers)
-    return jax.vmap(jax.vmap(env.reset))(keys)
+
+    def start(number: Array) -> State:
+        return jax.vmap(lambda key: env.reset(jax.random.fold_in(key, number)))(keys)
+
+    return jax.vmap(start)(jnp.arange(config.resets_per_update))
 
 
 def take_from_pool(pool: State, resets: Array) -> State:
@@ -197,8 +198,8 @@ def count_finished(finished: Finished, episode: EpisodeStats, over: Array, lost:
         episode_return=add(finished.episode_return, episode.episode_return),
         length=add(finished.length, episode.length.astype(jnp.float32)),
         metrics=metrics,
-        resets=finished.resets + over,
-        nonfinite_resets=finished.nonfinite_resets + lost,
+        resets=finished.resets + over.astype(jnp.int32),
+        nonfinite_resets=finished.nonfinite_resets + lost.astype(jnp.int32),
     )
 
 

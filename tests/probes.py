@@ -44,7 +44,7 @@ class Probe:
     def reset(self, key: Array) -> State:
         cue = _sign(key)
         zero = jnp.zeros(())
-        task = {"cue": cue, "time": jnp.zeros((), jnp.int32), "key": key}
+        task = {"cue": cue, "time": jnp.zeros((), jnp.int32)}
         shown = cue if self.name in CUED else zero
         return _state(shown[None], zero, jnp.zeros((), bool), task)
 

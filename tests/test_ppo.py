@@ -1,0 +1,354 @@
+"""PPO semantics: each line against a slow, obvious reference."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from purerl import networks, normalizer, ppo
+from purerl.env import State
+from purerl.rollout import rollout
+from purerl.types import count_as_int
+
+MLP = networks.MlpOptions(policy_hidden=(8,), value_hidden=(8,))
+GRU = networks.RecurrentOptions(hidden=8, encoder=(8,), value_hidden=(8,))
+LENGTH = 7
+CONFIG = ppo.Config(
+    num_steps=6 * 16 * 100,
+    num_envs=6,
+    rollout_length=16,
+    num_epochs=2,
+    num_minibatches=3,
+    episode_length=LENGTH,
+    gamma=0.9,
+    learning_rate=1e-2,
+    resets_per_update=3,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Walk:
+    """A number that drifts by the action; terminates beyond `edge`; NaN beyond `cliff`."""
+
+    edge: float = 1e3
+    cliff: float = 1e3
+    control_timestep: float = 1.0
+    action_size: int = 1
+
+    def reset(self, key):
+        x = jax.random.uniform(key, (), minval=-0.5, maxval=0.5)
+        return self.state(x, jnp.zeros(()), x)
+
+    def step(self, state, action):
+        x = state.physics["x"] + action[0]
+        return self.state(x, x - state.physics["x"], state.task["start"])
+
+    def state(self, x, reward, start):
+        broken = jnp.where(jnp.abs(x) > self.cliff, jnp.nan, x)
+        return State(
+            physics={"x": broken},
+            observation=jnp.stack([broken, jnp.square(broken)]),
+            reward=reward + jnp.where(jnp.abs(x) > self.cliff, jnp.nan, 0.0),
+            terminated=jnp.abs(x) > self.edge,
+            truncated=jnp.zeros((), bool),
+            metrics={"position": broken, "moves_count": jnp.ones(())},
+            task={"start": start},
+        )
+
+
+def setup(config=CONFIG, env=None, recurrent=False, seed=0):
+    """An initial state whose statistics are not trivial, and everything that made it."""
+    env = Walk() if env is None else env
+    build, options = (networks.recurrent, GRU) if recurrent else (networks.mlp, MLP)
+    network = build(options, jnp.zeros(2), 1)
+    state = jax.jit(partial(ppo.init, config, env, network))(jax.random.key(seed))
+    samples = jax.random.normal(jax.random.key(9), (50, 2)) * 2.0 + 0.3
+    statistics = normalizer.update(state.normalizer, samples, jnp.ones(50, bool))
+    return env, network, state.replace(normalizer=statistics)
+
+
+def act_for_a_rollout(config, env, network, state):
+    return jax.jit(partial(rollout, config, env, network))(state)
+
+
+@pytest.mark.parametrize("recurrent", [False, True])
+def test_the_first_ratio_is_one(recurrent):
+    """Before any gradient step, the learner computes the very log-probability that acted."""
+    config = dataclasses.replace(CONFIG, num_epochs=1, num_minibatches=1, num_envs=6)
+    env, network, state = setup(config, recurrent=recurrent)
+    _, metrics = jax.jit(partial(ppo.update, config, env, network))(state)
+    assert abs(metrics["kl"]) < 1e-10
+    assert metrics["clip_fraction"] == 0.0
+
+
+def test_statistics_are_frozen_until_the_end_of_the_update():
+    env, network, state = setup()
+    after, transitions, _, _ = act_for_a_rollout(CONFIG, env, network, state)
+    assert count_as_int(after.normalizer.count) == 50
+    updated, _ = jax.jit(partial(ppo.update, CONFIG, env, network))(state)
+    assert count_as_int(updated.normalizer.count) == 50 + 6 * 16
+    expected = normalizer.update(
+        state.normalizer, transitions.observation, jnp.ones((16, 6), bool)
+    )
+    np.testing.assert_allclose(
+        updated.normalizer.mean.value, expected.mean.value, rtol=1e-5, atol=1e-6
+    )
+
+
+def test_time_limits_truncate_and_the_first_are_staggered():
+    env, network, state = setup()
+    limits = np.asarray(state.episode.limit)
+    assert len(set(limits.tolist())) > 2 and limits.max() <= LENGTH and limits.min() >= 1
+    _, transitions, finished, _ = act_for_a_rollout(CONFIG, env, network, state)
+    done = np.asarray(transitions.done)
+    for b in range(6):
+        ends = np.flatnonzero(done[:, b]) + 1
+        assert ends[0] == limits[b]
+        assert (np.diff(ends) == LENGTH).all()
+    assert not transitions.terminated.any()
+    np.testing.assert_array_equal(transitions.truncated, done)
+    np.testing.assert_array_equal(finished.episodes, done.sum(0))
+
+
+def test_every_start_is_fresh():
+    """No two episodes of an update begin alike, nor do those of the next update."""
+    env, network, state = setup()
+    starts = []
+    update = jax.jit(partial(ppo.update, CONFIG, env, network))
+    for _ in range(2):
+        _, transitions, _, _ = act_for_a_rollout(CONFIG, env, network, state)
+        first = np.concatenate([np.zeros((1, 6), bool), np.asarray(transitions.done)[:-1]])
+        starts += np.asarray(transitions.observation)[first][:, 0].tolist()
+        state, metrics = update(state)
+        assert metrics["replayed_resets"] == 0
+    assert len(starts) > 20 and len(set(starts)) == len(starts)
+
+
+def test_replayed_starts_are_counted():
+    config = dataclasses.replace(CONFIG, resets_per_update=1)
+    env, network, state = setup(config)
+    _, transitions, finished, _ = act_for_a_rollout(config, env, network, state)
+    _, metrics = jax.jit(partial(ppo.update, config, env, network))(state)
+    ends = np.asarray(transitions.done).sum(0)
+    assert metrics["replayed_resets"] == np.maximum(ends - 1, 0).sum() > 0
+
+
+def slow_batch(transitions, last_value, observations_before_reset, value_of, gamma, lambda_):
+    """Advantages, one step at a time, with V of the observation before each reset."""
+    steps, size = transitions.reward.shape
+    advantage = np.zeros((steps + 1, size))
+    for t in reversed(range(steps)):
+        for b in range(size):
+            if transitions.truncated[t, b]:
+                following = value_of(observations_before_reset[t, b])
+            else:
+                following = transitions.value[t + 1, b] if t + 1 < steps else last_value[b]
+            alive = 1.0 - transitions.terminated[t, b]
+            delta = transitions.reward[t, b] + gamma * alive * following - transitions.value[t, b]
+            carry = 0.0 if transitions.done[t, b] else gamma * lambda_ * advantage[t + 1, b]
+            advantage[t, b] = delta + carry
+    return advantage[:-1]
+
+
+def test_truncation_bootstraps_from_the_observation_before_the_reset():
+    env, network, state = setup(env=Walk(edge=1.5))
+    after, transitions, _, last_value = act_for_a_rollout(CONFIG, env, network, state)
+    batch = ppo.make_batch(CONFIG, state, transitions, last_value, state.episode.length == 0)
+    transitions = jax.tree.map(np.asarray, transitions)
+    assert transitions.terminated.any() and transitions.truncated.any()
+    moved = transitions.observation[..., 0] + np.tanh(transitions.raw_action[..., 0])
+    before_reset = np.stack([moved, moved**2], -1)
+
+    def value_of(observation):
+        features = normalizer.normalize(state.normalizer, jnp.asarray(observation))
+        return float(network.apply(state.params, features, ())[0].value)
+
+    expected = slow_batch(
+        transitions, np.asarray(last_value), before_reset, value_of, 0.9, CONFIG.gae_lambda
+    )
+    np.testing.assert_allclose(batch.advantage, expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(batch.target, expected + transitions.value, rtol=1e-4, atol=1e-5)
+    first = np.asarray(batch.first)
+    np.testing.assert_array_equal(first[1:], transitions.done[:-1])
+    assert first[0].all()
+
+
+def test_recurrent_memory_restarts_with_each_episode_in_rollout_and_learner():
+    """The learner's unroll, from the stored memory, gives the rollout's values bit for bit."""
+    env, network, state = setup(recurrent=True)
+    update = jax.jit(partial(ppo.update, CONFIG, env, network))
+    for _ in range(2):  # so that memories are not zero when the rollout begins
+        state, _ = update(state)
+    assert jnp.abs(state.carry).max() > 0
+    _, transitions, _, last_value = act_for_a_rollout(CONFIG, env, network, state)
+    first = state.episode.length == 0
+    batch = ppo.make_batch(CONFIG, state, transitions, last_value, first)
+    output = ppo.unroll(network, state.params, batch, state.carry)
+    np.testing.assert_allclose(output.value, transitions.value, rtol=1e-5, atol=1e-6)
+    # By hand: at a start the memory is zero.
+    t, b = np.argwhere(np.asarray(batch.first)[1:])[0] + [1, 0]
+    features = batch.observation[t, b]
+    fresh = network.apply(state.params, features, jnp.zeros(8))[0].value
+    np.testing.assert_allclose(transitions.value[t, b], fresh, rtol=1e-5, atol=1e-6)
+
+
+def test_action_repeat_stops_at_the_end_of_an_episode():
+    """Episodes of 7 control steps, actions held for 3: 3 + 3 + 1, and rewards add up."""
+    config = dataclasses.replace(CONFIG, action_repeat=3, rollout_length=8)
+    env, network, state = setup(config)
+    state = state.replace(episode=state.episode.replace(limit=jnp.full(6, LENGTH, jnp.int32)))
+    _, transitions, finished, _ = act_for_a_rollout(config, env, network, state)
+    action = np.tanh(np.asarray(transitions.raw_action)[..., 0])
+    held = np.tile(np.array([3, 3, 1])[:, None], (3, 6))[:8]
+    np.testing.assert_allclose(transitions.reward, action * held, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(np.asarray(transitions.done)[:, 0], held[:, 0] == 1)
+    np.testing.assert_array_equal(finished.length / finished.episodes, LENGTH)
+    np.testing.assert_array_equal(finished.metrics["moves_count"] / finished.episodes, LENGTH)
+
+
+def test_a_blown_up_environment_is_contained():
+    """Environment 3 goes NaN: counted, reset, weight 0; the others' bits are the same."""
+    sound_env, network, state = setup()
+    # The last moves of environment 3 alone lead beyond the cliff.
+    x = state.env.physics["x"].at[3].set(40.0)
+    state = state.replace(env=state.env.replace(physics={"x": x}))
+    broken_env = Walk(cliff=39.5)
+    after, sound, _, _ = act_for_a_rollout(CONFIG, sound_env, network, state)
+    contained, lost, finished, _ = act_for_a_rollout(CONFIG, broken_env, network, state)
+    assert (~np.asarray(lost.valid)).sum(0).tolist()[3] >= 1
+    assert finished.nonfinite_resets.sum() == (~lost.valid).sum() == finished.nonfinite_resets[3]
+    for a, b in zip(jax.tree.leaves(sound), jax.tree.leaves(lost), strict=True):
+        others = [0, 1, 2, 4, 5]
+        np.testing.assert_array_equal(np.asarray(a)[:, others], np.asarray(b)[:, others])
+    for leaf in jax.tree.leaves((lost, contained.env, contained.episode)):
+        assert np.isfinite(np.asarray(leaf, np.float64)).all()
+    updated, metrics = jax.jit(partial(ppo.update, CONFIG, broken_env, network))(state)
+    assert metrics["nonfinite_resets"] >= 1 and metrics["skipped_minibatches"] == 0
+    valid = int(lost.valid.sum())
+    assert count_as_int(updated.normalizer.count) == 50 + valid < 50 + 6 * 16
+    for leaf in jax.tree.leaves(updated.params):
+        assert jnp.isfinite(leaf).all()
+
+
+def test_a_lost_sample_has_no_weight_in_the_update():
+    """Whatever stands in the lost rows, the gradient is the same."""
+    env, network, state = setup()
+    _, transitions, _, last_value = act_for_a_rollout(CONFIG, env, network, state)
+    valid = transitions.valid.at[5, 2].set(False)
+    done = transitions.done.at[5, 2].set(True)
+    lost = transitions._replace(valid=valid, done=done)
+    odd = lost._replace(
+        reward=lost.reward.at[5, 2].set(1e4), raw_action=lost.raw_action.at[5, 2].set(3.0)
+    )
+    learned = []
+    for x in (lost, odd):
+        batch = ppo.make_batch(CONFIG, state, x, last_value, state.episode.length == 0)
+        learned.append(ppo.learn(CONFIG, network, state, batch, ())[0])
+    for a, b in zip(*(jax.tree.leaves(x.params) for x in learned), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_non_finite_minibatch_is_skipped_and_counted():
+    env, network, state = setup()
+    _, transitions, _, last_value = act_for_a_rollout(CONFIG, env, network, state)
+    broken = transitions._replace(reward=transitions.reward.at[:].set(jnp.nan))
+    batch = ppo.make_batch(CONFIG, state, broken, last_value, state.episode.length == 0)
+    after, metrics = ppo.learn(CONFIG, network, state, batch, ())
+    assert metrics["skipped_minibatches"] == metrics["skipped_in_a_row"] == 6
+    assert np.isfinite(metrics["policy_loss"])
+    for a, b in zip(jax.tree.leaves(state.params), jax.tree.leaves(after.params), strict=True):
+        np.testing.assert_array_equal(a, b)
+    sound = ppo.make_batch(CONFIG, state, transitions, last_value, state.episode.length == 0)
+    again, _ = ppo.learn(CONFIG, network, after, sound, ())
+    assert again.skipped_in_a_row == 0
+
+
+def test_linear_schedule_and_exact_budget():
+    config = dataclasses.replace(CONFIG, schedule="linear", num_steps=6 * 16 * 4 + 95)
+    assert config.num_updates == 4 and config.num_updates * config.steps_per_update <= config.num_steps
+    env, network, state = setup(config)
+    update = jax.jit(partial(ppo.update, config, env, network))
+    rates = []
+    for _ in range(config.num_updates):
+        state, metrics = update(state)
+        rates.append(float(metrics["learning_rate"]))
+    np.testing.assert_allclose(rates, [1e-2, 7.5e-3, 5e-3, 2.5e-3], rtol=1e-6)
+    assert count_as_int(state.steps) == 6 * 16 * 4
+
+
+@pytest.mark.parametrize(("kl", "factor"), [(0.001, 1.5), (0.01, 1.0), (0.1, 1 / 1.5)])
+def test_adaptive_learning_rate(kl, factor):
+    config = dataclasses.replace(CONFIG, schedule="adaptive_kl", desired_kl=0.01)
+    rate = ppo.next_rate(config, jnp.asarray(1e-3), jnp.asarray(kl), jnp.asarray(True))
+    np.testing.assert_allclose(rate, 1e-3 * factor, rtol=1e-6)
+    unmoved = ppo.next_rate(config, jnp.asarray(1e-3), jnp.asarray(kl), jnp.asarray(False))
+    np.testing.assert_allclose(unmoved, 1e-3)
+
+
+def test_reward_scaling_by_the_running_return():
+    config = dataclasses.replace(CONFIG, reward_scaling="return_std")
+    env, network, state = setup(config)
+    assert ppo.reward_factor(config, state) == 1.0
+    _, transitions, _, _ = act_for_a_rollout(config, env, network, state)
+    state, _ = jax.jit(partial(ppo.update, config, env, network))(state)
+    # By hand: G_t = gamma G_{t-1} + r_t, from 0 after each end.
+    reward, done = np.asarray(transitions.reward), np.asarray(transitions.done)
+    running, returns = np.zeros(6), []
+    for r, d in zip(reward, done, strict=True):
+        running = 0.9 * running + r
+        returns.append(running.copy())
+        running[d] = 0.0
+    np.testing.assert_allclose(ppo.reward_factor(config, state), 1 / np.std(returns), rtol=1e-4)
+
+
+def test_the_same_seed_learns_the_same_bits_and_another_does_not():
+    states = []
+    for seed in (0, 0, 1):
+        env, network, state = setup(seed=seed)
+        update = jax.jit(partial(ppo.update, CONFIG, env, network))
+        for _ in range(3):
+            state, _ = update(state)
+        states.append(np.concatenate([np.ravel(x) for x in jax.tree.leaves(state.params)]))
+    np.testing.assert_array_equal(states[0], states[1])
+    assert (states[0] != states[2]).any()
+
+
+def test_update_keeps_rank_promotion_strict():
+    """`[B, 1] - [B]` would silently become `[B, B]`; the whole update is traced without it."""
+    env, network, state = setup(recurrent=True)
+    with jax.numpy_rank_promotion("raise"):
+        jax.jit(partial(ppo.update, CONFIG, env, network)).trace(state)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"num_steps": 95}, ("num_steps is 95", "96")),
+        ({"gamma": 1.5}, ("gamma is 1.5", "[0, 1]")),
+        ({"num_envs": 0}, ("num_envs is 0", "at least 1")),
+        ({"clip": 0.0}, ("clip is 0.0", "above 0")),
+    ],
+)
+def test_impossible_settings_are_refused(changes, words):
+    with pytest.raises(ValueError) as error:
+        dataclasses.replace(CONFIG, **changes)
+    for word in words:
+        assert word in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("recurrent", "minibatches", "words"),
+    [
+        (False, 7, ("num_minibatches = 7", "num_envs * rollout_length = 96", "6, 8", "91 or 98")),
+        (True, 4, ("num_minibatches = 4", "num_envs = 6", "3", "4 or 8")),
+    ],
+)
+def test_sizes_that_do_not_divide(recurrent, minibatches, words):
+    config = dataclasses.replace(CONFIG, num_minibatches=minibatches)
+    with pytest.raises(ValueError) as error:
+        setup(config, recurrent=recurrent)
+    for word in words:
+        assert word in str(error.value)
