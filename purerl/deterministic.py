@@ -26,6 +26,8 @@ _CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_ca
 _CALLS |= {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "checkpoint": "jaxpr"}
 _CALLS |= {"remat2": "jaxpr", "remat": "jaxpr"}
 
+_FEW_TERMS = 4
+
 Known = Callable[[], np.ndarray] | None  # gives a value known while tracing
 
 
@@ -264,11 +266,20 @@ def _ordered_scatter(eqn: core.JaxprEqn, inputs: list, known: list[Known]) -> Ar
         )
     order = _order_of_sums(_addresses(eqn, known[1]()), operand.size)
     total, flat = jnp.reshape(operand, (-1,)), jnp.reshape(updates, (-1,))
-    for term in order:
-        present = term >= 0
-        addend = flat[np.maximum(term, 0)]
-        total = total + (addend if present.all() else jnp.where(present, addend, 0))
+    if len(order) <= _FEW_TERMS:
+        for turn in order:
+            total = total + _terms(flat, turn)
+    else:
+        # One gather and one reduction: a long chain of sums takes XLA minutes to compile.
+        total = total + jnp.sum(_terms(flat, np.stack(order)), axis=0)
     return jnp.reshape(total, operand.shape)
+
+
+def _terms(flat: Array, update: np.ndarray) -> Array:
+    """Takes the updates of the given numbers, 0 where there is none (-1)."""
+    present = update >= 0
+    terms = flat[np.maximum(update, 0)]
+    return terms if present.all() else jnp.where(present, terms, 0)
 
 
 def _addresses(eqn: core.JaxprEqn, indices: np.ndarray) -> np.ndarray:
