@@ -1,0 +1,304 @@
+"""Checkpoints: a whole TrainState on disk, with a hash of every leaf, so that damage is noticed.
+
+Orbax commits a step by renaming a finished folder, which survives a kill at any moment. It checks
+no array bytes, deletes in place, and its manager's idea of the latest step goes wrong on a full
+disk. So here: hashes beside the arrays, deletion by rename, and the truth read from the folder.
+
+A state travels as `{path: array}`. A typed key's path ends in `|<implementation>`; zero-size
+arrays, which Orbax refuses, count in the digest but are not written.
+"""
+
+import hashlib
+import json
+import logging
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from purerl.errors import UserError
+from purerl.types import PyTree
+
+Leaves = dict[str, np.ndarray]
+
+
+class DamagedError(Exception):
+    """A checkpoint that cannot be read whole; the message names the leaf or the file."""
+
+
+class Saved(NamedTuple):
+    """One checkpoint read back, every hash checked."""
+
+    state: PyTree
+    meta: dict[str, Any]  # update, steps, digest, and what else `save` was given
+    path: Path
+
+
+# --- a state as named arrays ---
+
+
+def leaf_paths(state: PyTree) -> list[str]:
+    """Returns the path of every leaf, in the order of `jax.tree.leaves`; abstract states too."""
+    named = jax.tree_util.tree_flatten_with_path(state)[0]
+    return [
+        jax.tree_util.keystr(path, simple=True, separator="/") + _key_suffix(leaf)
+        for path, leaf in named
+    ]
+
+
+def flatten(state: PyTree) -> Leaves:
+    """Copies a state to the host as `{path: array}`, keys as their raw data.
+
+    The copy is real: on a CPU `device_get` returns views of buffers that the next, donating update
+    overwrites.
+    """
+    raw = jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, state)
+    host = [np.array(x, copy=True, order="C") for x in jax.tree.leaves(jax.device_get(raw))]
+    return dict(zip(leaf_paths(state), host, strict=True))
+
+
+def unflatten(leaves: Leaves, abstract: PyTree) -> PyTree:
+    """Rebuilds a state on the device from `flatten`'s arrays (zero-size ones may be absent)."""
+    out = []
+    for path, like in zip(leaf_paths(abstract), jax.tree.leaves(abstract), strict=True):
+        # A real copy again: a buffer shared with numpy must not be donated.
+        array = jnp.array(_empty(like) if like.size == 0 else leaves[path], copy=True)
+        out.append(jax.random.wrap_key_data(array, impl=_impl(like)) if _is_key(like) else array)
+    return jax.tree.unflatten(jax.tree.structure(abstract), out)
+
+
+def digest(state: PyTree) -> str:
+    """Returns the sha256 of a state: two runs with equal digests are the same run."""
+    return digest_leaves(flatten(state))
+
+
+def digest_leaves(leaves: Leaves) -> str:
+    """Returns a sha256 over path, dtype, shape and bytes of every leaf, in path order."""
+    total = hashlib.sha256()
+    for path, array in sorted(leaves.items()):
+        total.update(f"{path}\0{array.dtype}\0{array.shape}\0".encode())
+        total.update(array.tobytes())
+    return total.hexdigest()
+
+
+# --- on disk ---
+
+
+def save(folder: Path, leaves: Leaves, meta: dict[str, Any]) -> Path:
+    """Writes a checkpoint under `folder` and returns its path; blocks until it is on the disk.
+
+    Args:
+      folder: the run's `checkpoints/`.
+      leaves: `flatten` of the state.
+      meta: JSON values, with at least "update"; hashes are added here.
+
+    Raises:
+      OSError or ValueError when the disk refuses; nothing partial is left behind.
+    """
+    ocp = _orbax()
+    meta = meta | {"leaves": {path: _describe(array) for path, array in leaves.items()}}
+    path = folder / f"{meta['update']:012d}"
+    discard(path)
+    stored = {key: array for key, array in leaves.items() if array.size}
+    try:
+        with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
+            checkpointer.save(
+                path.absolute(),
+                ocp.args.Composite(
+                    state=ocp.args.StandardSave(stored),
+                    meta=ocp.args.JsonSave(meta | {"meta_sha256": _meta_hash(meta)}),
+                ),
+            )
+        _flush(path)
+    except BaseException:
+        clean(folder)
+        raise
+    return path
+
+
+def load(path: Path, abstract: PyTree) -> Saved:
+    """Reads one checkpoint and checks every hash.
+
+    Raises:
+      DamagedError: a file or a leaf is not what was written.
+      UserError: it is whole, but of another state than `abstract` (other sizes or networks).
+    """
+    meta = load_meta(path)
+    _check_fits(path, meta, abstract)
+    ocp = _orbax()
+    leaves = {key: _blank(about) for key, about in meta["leaves"].items()}
+    target = {key: array for key, array in leaves.items() if array.size}
+    try:
+        with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
+            arguments = ocp.args.Composite(state=ocp.args.StandardRestore(target))
+            leaves |= checkpointer.restore(path.absolute(), arguments).state
+    except Exception as error:  # Orbax raises many kinds for broken files, none of them its own
+        raise DamagedError(f"its arrays cannot be read ({type(error).__name__})") from error
+    for key, about in meta["leaves"].items():
+        if _describe(leaves[key]) != about:
+            raise DamagedError(
+                f"leaf {key} does not have the bytes that were written (sha256 differs)"
+            )
+    if digest_leaves(leaves) != meta["digest"]:
+        raise DamagedError("the digest of all leaves differs from the one written with them")
+    return Saved(unflatten(leaves, abstract), meta, path)
+
+
+def load_meta(path: Path) -> dict[str, Any]:
+    """Reads a checkpoint's metadata; DamagedError unless it is what was written."""
+    try:
+        meta = json.loads((path / "meta" / "metadata").read_text())
+        expected = meta.pop("meta_sha256")
+    except (OSError, ValueError, KeyError, AttributeError) as error:
+        raise DamagedError(f"its metadata cannot be read ({type(error).__name__})") from error
+    if _meta_hash(meta) != expected:
+        raise DamagedError("its metadata is not what was written (sha256 differs)")
+    return meta
+
+
+def updates(folder: Path) -> list[int]:
+    """Returns the updates that have a checkpoint folder, oldest first; whole or not."""
+    if not folder.is_dir():
+        return []
+    return sorted(int(d.name) for d in folder.iterdir() if d.name.isdigit() and d.is_dir())
+
+
+def newest(
+    folder: Path, abstract: PyTree, say: Callable[[str], None], set_aside: bool = True
+) -> Saved | None:
+    """Reads the newest checkpoint that is whole, telling of each one that is not; None without any.
+
+    Args:
+      set_aside: rename damaged ones to `damaged-<n>-<update>`; False for readers of a run that
+        may be another process's.
+    """
+    for update in reversed(updates(folder)):
+        path = folder / f"{update:012d}"
+        try:
+            return load(path, abstract)
+        except DamagedError as error:
+            kept = _set_aside(path) if set_aside else path
+            say(f"Checkpoint of update {update} is damaged: {error}. It is kept as {kept}; "
+                "using the one before it.")  # fmt: skip
+    return None
+
+
+def retain(folder: Path, keep: int) -> None:
+    """Deletes all but the newest `keep` checkpoints and the best one by evaluation."""
+    found = updates(folder)
+    best = best_update(folder)
+    for update in found[:-keep] if keep else []:
+        if update != best:
+            discard(folder / f"{update:012d}")
+
+
+def best_update(folder: Path) -> int | None:
+    """Returns the update of the checkpoint with the highest evaluation return, None without any."""
+    scored = [(meta["eval_return"], meta["update"]) for meta in _metas(folder)]
+    scored = [pair for pair in scored if pair[0] is not None]
+    return max(scored)[1] if scored else None
+
+
+def discard(path: Path) -> None:
+    """Deletes a checkpoint so that a kill in between leaves none that looks whole."""
+    if path.exists():
+        doomed = path.with_name(f".deleting-{path.name}")
+        shutil.rmtree(doomed, ignore_errors=True)
+        path.rename(doomed)
+        shutil.rmtree(doomed, ignore_errors=True)
+
+
+def clean(folder: Path) -> None:
+    """Removes what a crash or a full disk left: unfinished saves and unfinished deletions."""
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if "orbax-checkpoint-tmp" in path.name or path.name.startswith(".deleting-"):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+# --- parts ---
+
+
+def _is_key(x: Any) -> bool:
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def _impl(key: Any) -> str:
+    """Returns the name of a key's implementation; of abstract keys too, which key_impl refuses."""
+    return str(jax.random.key_impl(jnp.empty((0,), key.dtype)))
+
+
+def _key_suffix(leaf: Any) -> str:
+    return f"|{_impl(leaf)}" if _is_key(leaf) else ""
+
+
+def _empty(like: Any) -> np.ndarray:
+    if _is_key(like):
+        raise ValueError(f"A zero-size array of keys (shape {like.shape}) cannot be rebuilt.")
+    return np.zeros(like.shape, like.dtype)
+
+
+def _blank(about: dict[str, Any]) -> np.ndarray:
+    return np.zeros(about["shape"], jnp.dtype(about["dtype"]))
+
+
+def _describe(array: np.ndarray) -> dict[str, Any]:
+    content = hashlib.sha256(np.asarray(array).tobytes()).hexdigest()
+    return {"dtype": str(array.dtype), "shape": list(array.shape), "sha256": content}
+
+
+def _check_fits(path: Path, meta: dict[str, Any], abstract: PyTree) -> None:
+    raw = jax.eval_shape(
+        lambda s: jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, s), abstract
+    )
+    shapes = [[str(x.dtype), list(x.shape)] for x in jax.tree.leaves(raw)]
+    wanted = dict(zip(leaf_paths(abstract), shapes, strict=True))
+    stored = {key: [about["dtype"], about["shape"]] for key, about in meta["leaves"].items()}
+    for key in sorted({*wanted, *stored}):
+        if wanted.get(key) != stored.get(key):
+            raise UserError(
+                f"The checkpoint {path} is of another state: leaf {key} is "
+                f"{stored.get(key, 'absent')} in it and {wanted.get(key, 'absent')} in this "
+                "experiment. Use the settings that the run was started with."
+            )
+
+
+def _metas(folder: Path) -> Iterator[dict[str, Any]]:
+    for update in updates(folder):
+        try:
+            yield load_meta(folder / f"{update:012d}")
+        except DamagedError:
+            continue
+
+
+def _meta_hash(meta: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(meta, sort_keys=True).encode()).hexdigest()
+
+
+def _set_aside(path: Path) -> Path:
+    count = 0
+    while (kept := path.with_name(f"damaged-{count}-{path.name}")).exists():
+        count += 1
+    return path.rename(kept)
+
+
+def _flush(path: Path) -> None:
+    """Forces a checkpoint to the disk before an older one is deleted: Orbax calls no fsync."""
+    for file in [*path.rglob("*"), path, path.parent]:
+        handle = os.open(file, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def _orbax() -> Any:
+    """Imports Orbax late (0.3 s), and without its running commentary."""
+    logging.getLogger("absl").setLevel(logging.ERROR)
+    import orbax.checkpoint
+
+    return orbax.checkpoint

@@ -1,0 +1,119 @@
+"""What a person sees of a run: the plan, a live bar on a terminal, plain lines elsewhere."""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from purerl.loggers import Record
+from purerl.rundir import Setup
+from purerl.train import Plan
+from purerl.types import PyTree
+
+SECONDS_BETWEEN_LINES = 2.0
+
+
+def describe_plan(
+    plan: Plan, setup: Setup, abstract: PyTree, facts: dict[str, Any], folder: Path, cache: str
+) -> list[str]:
+    """Returns every derived number of a run, as lines, before anything heavy starts."""
+    left = setup.config.num_steps - plan.steps
+    rounded = f", {left:,} fewer than num_steps: whole updates only" if left else ""
+    device = facts["device"]
+    return [
+        f"run          {folder}",
+        f"updates      {plan.updates:,} of {plan.steps_per_update:,} steps",
+        f"steps        {plan.steps:,}{rounded}",
+        f"evaluations  {_ticks(plan.evaluations)}",
+        f"checkpoints  {_ticks(plan.checkpoints)}",
+        f"metrics      a line every {plan.log_every} updates",
+        f"parameters   {count(abstract.params):,}",
+        f"state        {size(abstract) / 1e6:,.1f} MB",
+        f"engine       {setup.engine}",
+        f"device       {device['count']} x {device['kind']} ({device['platform']})",
+        f"cache        {cache}",
+    ]
+
+
+def _ticks(updates: tuple[int, ...]) -> str:
+    return f"{len(updates)}, the first after update {updates[0]:,}" if updates else "none"
+
+
+def count(tree: PyTree) -> int:
+    """Returns the number of numbers in a tree."""
+    return sum(leaf.size for leaf in jax.tree.leaves(tree))
+
+
+def size(tree: PyTree) -> int:
+    """Returns the bytes of a tree's arrays; of abstract ones too."""
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+
+
+class Lines:
+    """Progress as plain lines, for logs and pipes."""
+
+    def __init__(self, updates: int) -> None:
+        """Shows how far of `updates` a run is."""
+        self.updates = updates
+        self.shown = 0.0  # when, by the monotonic clock [s]
+
+    def say(self, line: str) -> None:
+        """Prints a line."""
+        print(line, flush=True)
+
+    def show(self, record: Record, seconds_left: float, steps_per_second: float) -> None:
+        """Prints a line for a chunk, unless one has just been printed."""
+        now = time.monotonic()
+        last = record["update"] >= self.updates
+        if now - self.shown < SECONDS_BETWEEN_LINES and not last:
+            return
+        self.shown = now
+        self.say(
+            f"update {record['update']}/{self.updates}  "
+            + figures(record, seconds_left, steps_per_second)
+        )
+
+
+def figures(record: Record, seconds_left: float, steps_per_second: float) -> str:
+    """Returns a chunk's figures as a person reads them."""
+    value = record.get("train/episode_return")
+    shown = "-" if value is None else f"{value:.2f}"
+    left = f"{seconds_left // 3600:.0f}:{seconds_left % 3600 // 60:02.0f}:{seconds_left % 60:02.0f}"
+    return (
+        f"steps {record['steps']:,}  return {shown}  {steps_per_second:,.0f} steps/s  left {left}"
+    )
+
+
+class Bar:
+    """Progress as a live bar, for a terminal."""
+
+    def __init__(self, updates: int, bar: Any) -> None:
+        """Drives a `rich` progress display."""
+        self.bar = bar
+        self.task = bar.add_task("", total=updates)
+
+    def say(self, line: str) -> None:
+        """Prints a line above the bar."""
+        self.bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    def show(self, record: Record, seconds_left: float, steps_per_second: float) -> None:
+        """Moves the bar."""
+        text = figures(record, seconds_left, steps_per_second)
+        self.bar.update(self.task, completed=record["update"], description=text)
+
+
+@contextmanager
+def progress(updates: int) -> Iterator[Lines | Bar]:
+    """Yields a live bar where standard output is a terminal, plain lines elsewhere."""
+    if not sys.stdout.isatty():
+        yield Lines(updates)
+        return
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+    columns = (BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"))
+    with Progress(*columns) as bar:
+        yield Bar(updates, bar)

@@ -1,0 +1,42 @@
+"""Errors that a person can act on: one line, no traceback, and an exit code."""
+
+import difflib
+from collections.abc import Iterable
+
+SUCCESS = 0
+FAILURE = 1  # the run could not go on: non-finite numbers, a disk that refuses the last checkpoint
+USAGE = 2  # the command asks for something that cannot be done
+INTERRUPTED = 3  # stopped by SIGTERM or SIGINT after saving; the same command with --resume goes on
+
+
+class UserError(Exception):
+    """A mistake in the command, a file or the machine's set-up; the message says how to mend it."""
+
+    exit_code = USAGE
+
+
+class RunError(Exception):
+    """A run that cannot go on."""
+
+    exit_code = FAILURE
+
+
+class StoppedError(Exception):
+    """A run that was asked to stop, and stopped in good order."""
+
+    exit_code = INTERRUPTED
+
+
+def unknown(kind: str, name: str, valid: Iterable[str], where: str = "") -> UserError:
+    """Returns the error for a name that is none of `valid`: the nearest ones first, then all."""
+    valid = sorted(valid)
+    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
+    hint = f" Did you mean {near[0]}?" if near else ""
+    listed = ", ".join(valid) if valid else "none"
+    return UserError(f"There is no {kind} {name!r}{where}.{hint} Valid: {listed}.")
+
+
+def one_line(error: BaseException) -> str:
+    """Returns an exception as one line of text, with its class where the message alone is bare."""
+    text = " ".join(str(error).split())
+    return text if len(text) > 20 else f"{type(error).__name__}: {text}"

@@ -1,0 +1,236 @@
+"""Experiments: builder functions and the data they are called with, in one file a person copies.
+
+This module imports nothing heavy, so that a list of experiments or a help page comes at once.
+"""
+
+import ast
+import dataclasses
+import enum
+import importlib
+import importlib.util
+import sys
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+
+import tyro
+
+from purerl.errors import UserError, one_line, unknown
+
+if TYPE_CHECKING:
+    from purerl.config import Config
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """When and how the policy is evaluated during training; never changes training by a bit."""
+
+    num_episodes: int = 32
+    """Whole episodes in each evaluation."""
+    number: int = 10
+    """Evaluations over the run, evenly spaced, the last one at the end; 0: none."""
+
+    def __post_init__(self) -> None:
+        """Checks the rules."""
+        if self.num_episodes < 1:
+            raise ValueError(f"num_episodes is {self.num_episodes}; it must be at least 1.")
+        if self.number < 0:
+            raise ValueError(f"number is {self.number}; it must be at least 0.")
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What is trained and how: builders (functions) and settings (frozen dataclasses).
+
+    `build_env(env, engine) -> Env` and `build_network(network, observation, action_size) ->
+    Network`, where `observation` is one environment's, zeros of the right shapes. Every setting can
+    be overridden on the command line: `--ppo.learning-rate 1e-3 --env.forward-weight 2`.
+    """
+
+    build_env: Callable[[Any, str], Any]
+    env: Any
+    build_network: Callable[[Any, Any, int], Any]
+    network: Any
+    ppo: "Config"
+    seed: Annotated[int, tyro.conf.arg(help="Seed of everything random in the run.")] = 1
+    engine: Annotated[
+        Literal["auto", "c", "jax", "warp"],
+        tyro.conf.arg(
+            help="Physics engine; auto: c (MuJoCo's C code) where JAX runs on a CPU, else jax (MJX)."
+        ),
+    ] = "auto"
+    evaluation: Evaluation = Evaluation()
+
+
+BUILDERS = ("build_env", "build_network")
+
+
+class Source(NamedTuple):
+    """An experiment and where it came from."""
+
+    experiment: Experiment
+    name: str  # names the folder under runs/
+    path: Path
+
+
+# --- finding ---
+
+
+def folders() -> list[Path]:
+    """Returns where named experiments are looked for: here, then beside the library."""
+    places = [Path.cwd() / "experiments", Path(__file__).parent.parent / "experiments"]
+    return [place for place in dict.fromkeys(places) if place.is_dir()]
+
+
+def available() -> dict[str, Path]:
+    """Returns the named experiments, name -> file; the first folder wins."""
+    files = [file for folder in reversed(folders()) for file in sorted(folder.glob("*.py"))]
+    return {file.stem: file for file in files if not file.stem.startswith("_")}
+
+
+def summary(path: Path) -> str:
+    """Returns the first line of a file's docstring, without running the file."""
+    try:
+        text = ast.get_docstring(ast.parse(path.read_text()))
+    except (OSError, SyntaxError):
+        text = None
+    return text.splitlines()[0] if text else ""
+
+
+def find(name: str) -> Source:
+    """Loads an experiment by name in experiments/, path of a Python file, or dotted module."""
+    named = available()
+    if name.endswith(".py") or "/" in name:
+        path = Path(name)
+        if not path.is_file():
+            raise UserError(f"There is no experiment file {name}.")
+        return load(path)
+    if name in named:
+        return load(named[name])
+    if "." in name:
+        return _from_module(name)
+    raise unknown("experiment", name, named, f" in {' or '.join(map(str, folders())) or 'sight'}")
+
+
+def load(path: Path, name: str = "") -> Source:
+    """Loads the experiment that a Python file defines as `experiment = Experiment(...)`."""
+    path = path.resolve()
+    # A file of a package, imported under its own name, so that its source counts as the package's.
+    if (path.parent / "__init__.py").exists() and str(path.parent.parent) in sys.path:
+        return _checked(_execute(f"{path.parent.name}.{path.stem}", path), name or path.stem, path)
+    return _checked(_execute(f"purerl_experiment_{path.stem}", path), name or path.stem, path)
+
+
+def _execute(module_name: str, path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    assert spec is not None and spec.loader is not None  # it is an existing .py file
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[module_name] = module  # dataclasses and help texts look their module up
+    try:
+        spec.loader.exec_module(module)
+    except SyntaxError as error:
+        raise UserError(f"{path}, line {error.lineno}: {error.msg}.") from error
+    except Exception as error:  # the file is a person's own: its line is what they need to see
+        frames = traceback.extract_tb(error.__traceback__)
+        lines = [frame.lineno for frame in frames if frame.filename == spec.origin]
+        where = f", line {lines[-1]}" if lines else ""
+        raise UserError(f"{path}{where}: {one_line(error)}") from error
+    return module
+
+
+def _from_module(name: str) -> Source:
+    try:
+        module = importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not name.startswith(error.name):
+            raise  # the module is there, and itself imports something that is not
+        raise unknown("experiment", name, available()) from error
+    return _checked(module, name.rpartition(".")[2], Path(str(module.__file__)))
+
+
+def _checked(module: ModuleType, name: str, path: Path) -> Source:
+    found = getattr(module, "experiment", None)
+    if not isinstance(found, Experiment):
+        raise UserError(f"{path} defines no `experiment = Experiment(...)` (it is {found!r}).")
+    for field in ("env", "network", "ppo", "evaluation"):
+        value = getattr(found, field)
+        if not dataclasses.is_dataclass(value) or isinstance(value, type):
+            raise UserError(f"{path}: {field} is {value!r}; it must be a frozen dataclass's value.")
+    return Source(found, name, path)
+
+
+# --- settings as JSON ---
+
+
+def settings(experiment: Experiment) -> dict[str, Any]:
+    """Returns everything of an experiment but its builders, by field name."""
+    return {
+        field.name: getattr(experiment, field.name)
+        for field in dataclasses.fields(experiment)
+        if field.name not in BUILDERS
+    }
+
+
+def to_json(value: Any, path: str = "") -> Any:
+    """Turns settings into JSON values; UserError names a field that JSON cannot hold."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
+        value = {k: v for k, v in value.items() if k not in BUILDERS}
+    if isinstance(value, enum.Enum):
+        return value.name
+    if isinstance(value, dict) and all(isinstance(key, str) for key in value):
+        return {key: to_json(v, f"{path}.{key}" if path else key) for key, v in value.items()}
+    if isinstance(value, tuple | list):
+        return [to_json(v, f"{path}[{i}]") for i, v in enumerate(value)]
+    if isinstance(value, Path):
+        return str(value)
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise UserError(
+        f"{path} is a {type(value).__name__}, which config.json cannot hold. Settings are numbers, "
+        "strings, None, and tuples, dicts and dataclasses of them; build the rest in build_env."
+    )
+
+
+def from_json(template: Any, values: Any, path: str = "") -> Any:
+    """Returns `template` with JSON values in place of its own, the inverse of `to_json`.
+
+    Raises:
+      UserError: a field is missing or unknown: the code is not the one that wrote the values.
+    """
+    if dataclasses.is_dataclass(template) and not isinstance(template, type):
+        names = [f.name for f in dataclasses.fields(template) if f.init and f.name not in BUILDERS]
+        _check_names(names, values, path)
+        inner = {n: from_json(getattr(template, n), values[n], _join(path, n)) for n in names}
+        try:
+            return dataclasses.replace(template, **inner)
+        except ValueError as error:
+            raise UserError(f"{path or 'experiment'}: {error}") from error
+    if isinstance(template, enum.Enum):
+        return type(template)[values]
+    if isinstance(template, Path):
+        return Path(values)
+    if isinstance(values, list) and not isinstance(template, list):
+        return _as_tuple(values)
+    return values
+
+
+def _as_tuple(values: Any) -> Any:
+    return tuple(_as_tuple(v) for v in values) if isinstance(values, list) else values
+
+
+def _join(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else name
+
+
+def _check_names(names: list[str], values: Any, path: str) -> None:
+    if not isinstance(values, dict):
+        raise UserError(f"The settings of {path} are {values!r}; they must be {{name: value}}.")
+    for name in sorted({*names, *values}):
+        if name not in values:
+            raise UserError(f"config.json lacks {_join(path, name)}, which the experiment has.")
+        if name not in names:
+            raise unknown("setting", _join(path, name), [_join(path, n) for n in names])

@@ -1,0 +1,127 @@
+"""What a run depends on besides its settings: versions, device, flags, source.
+
+The same settings give the same bits only under the same manifest, so it is written down at the
+start, compared on resuming, and its fingerprint stands in every checkpoint.
+"""
+
+import hashlib
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
+INFORMATIVE = ("run_id", "git_revision", "git_dirty", "allowed_changes", "host")
+FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE", "JAX_PLATFORMS", "JAX_ENABLE_X64")
+
+
+def collect(engine: str, builders: Iterable[Callable]) -> dict[str, Any]:
+    """Describes this process: all that decides a run's bits apart from the run's own settings.
+
+    Args:
+      engine: the physics engine in use, resolved ("auto" is not an answer).
+      builders: functions whose source folders are part of the run (build_env, build_network).
+    """
+    import jax
+
+    device = jax.devices()[0]
+    found = {
+        "versions": {"python": platform.python_version()} | {p: _version(p) for p in PACKAGES},
+        "device": {"platform": device.platform, "kind": _device_kind(device)},
+        "engine": engine,
+        "matmul_precision": str(jax.config.jax_default_matmul_precision or "default"),
+        "x64": bool(jax.config.jax_enable_x64),
+        "prng": str(jax.config.jax_default_prng_impl),
+        "threefry_partitionable": bool(jax.config.jax_threefry_partitionable),
+        "flags": {name: os.environ[name] for name in FLAGS if name in os.environ},
+        "source": source_hash(builders),
+        "host": platform.node(),
+    } | _git(Path(__file__).parent)
+    found["device"]["count"] = jax.device_count()
+    if device.platform == "cpu":  # XLA's pool size changes the bits of matrix products on a CPU
+        found["device"]["threads"] = cpu_threads()
+    return found
+
+
+def cpu_threads() -> int:
+    """Returns the size of XLA's CPU thread pool: NPROC where it is set, else the usable cores."""
+    pinned = os.environ.get("NPROC", "") or os.environ.get("PJRT_NPROC", "")
+    return int(pinned) if pinned.isdigit() else len(os.sched_getaffinity(0))
+
+
+def fingerprint(manifest: dict[str, Any]) -> str:
+    """Returns a sha256 over everything in the manifest that can change a run's bits."""
+    relevant = {key: value for key, value in manifest.items() if key not in INFORMATIVE}
+    return hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()
+
+
+def differences(old: Any, new: Any, path: str = "") -> list[str]:
+    """Lists where two JSON values differ, as `path: old -> new`, but for INFORMATIVE keys."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        keys = [key for key in sorted({*old, *new}) if path or key not in INFORMATIVE]
+        missing = "(absent)"
+        return [
+            line
+            for key in keys
+            for line in differences(
+                old.get(key, missing), new.get(key, missing), f"{path}.{key}" if path else key
+            )
+        ]
+    return [] if old == new else [f"{path}: {old} -> {new}"]
+
+
+def source_hash(builders: Iterable[Callable]) -> str:
+    """Returns a sha256 over the Python source of this package and of the builders' packages."""
+    folders = {Path(__file__).parent}
+    for builder in builders:
+        module = sys.modules.get(getattr(builder, "__module__", ""), None)
+        if module is not None and getattr(module, "__package__", "") and module.__file__:
+            folders.add(Path(module.__file__).parent)
+    total = hashlib.sha256()
+    # Sorted by what is hashed, not by where it lies: a moved checkout is the same source.
+    for name, file in sorted((f"{d.name}/{f.name}", f) for d in folders for f in d.glob("*.py")):
+        total.update(name.encode() + b"\0" + file.read_bytes())
+    return total.hexdigest()
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "absent"
+
+
+def _device_kind(device: Any) -> str:
+    """Returns the device's model; for a CPU the processor's, since kernels are chosen by it."""
+    if device.platform != "cpu":
+        return device.device_kind
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def _git(folder: Path) -> dict[str, Any]:
+    """Returns the revision of the checkout that `folder` is in, None outside of one."""
+
+    def ask(*words: str) -> str | None:
+        try:
+            done = subprocess.run(
+                ["git", "-C", str(folder), *words], capture_output=True, text=True, timeout=10
+            )
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    status = ask("status", "--porcelain", "--untracked-files=no")
+    return {
+        "git_revision": ask("rev-parse", "HEAD"),
+        "git_dirty": None if status is None else bool(status),
+    }

@@ -1,0 +1,190 @@
+"""A run's folder: who may write to it, what it says about the run, and how to rebuild it."""
+
+import fcntl
+import json
+import os
+import shutil
+import uuid
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+from purerl import checkpoint, experiment, manifest, train
+from purerl.config import Config
+from purerl.env import Env
+from purerl.errors import UserError, one_line
+from purerl.experiment import Experiment, Source
+from purerl.loggers import Say
+from purerl.types import Network
+
+LOCK = ".lock"
+OURS = {LOCK, "config.json", "manifest.json", "experiment.py", "metrics.jsonl", "checkpoints"}
+
+
+class Setup(NamedTuple):
+    """An experiment's objects, built."""
+
+    config: Config
+    env: Env
+    network: Network
+    engine: str  # resolved: never "auto"
+
+
+class Run(NamedTuple):
+    """A run read back from its folder alone."""
+
+    experiment: Experiment
+    setup: Setup
+    saved: checkpoint.Saved
+    settings: dict[str, Any]  # config.json
+
+
+def build(chosen: Experiment) -> Setup:
+    """Calls the builders; a setting that breaks a rule becomes a UserError."""
+    import jax
+    import jax.numpy as jnp
+
+    from purerl.physics import choose_engine
+
+    try:
+        engine = choose_engine(chosen.engine)
+        env = chosen.build_env(chosen.env, engine)
+        state = jax.eval_shape(env.reset, jax.random.key(0))
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state.observation)
+        network = chosen.build_network(chosen.network, zeros, env.action_size)
+        setup = Setup(chosen.ppo, env, network, engine)
+        train.abstract_state(*setup[:3])  # sizes that do not fit together show here, in a second
+    except (ValueError, ImportError) as error:
+        raise UserError(one_line(error)) from error
+    return setup
+
+
+def lock(folder: Path) -> IO[str]:
+    """Makes the folder and takes it for this process; released when the process ends, however."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = (folder / LOCK).open("a+")
+    except OSError as error:
+        raise UserError(f"The folder {folder} cannot be written: {error.strerror}.") from error
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        handle.seek(0)
+        owner = handle.read().strip() or "unknown"
+        raise UserError(
+            f"The run {folder} is being written by process {owner}; stop that one first, or use "
+            "another --name."
+        ) from error
+    handle.truncate(0)
+    handle.write(str(os.getpid()))
+    handle.flush()
+    return handle
+
+
+def check_new_or_resume(folder: Path, resume: bool) -> None:
+    """Raises UserError when the folder holds a run and should not, or the other way round."""
+    if resume and not folder.exists():
+        raise UserError(f"There is no run {folder} to resume; leave out --resume to start it.")
+    if not resume and (folder / "config.json").exists():
+        raise UserError(f"The run {folder} exists; use --resume to go on, or another --name.")
+    strange = {path.name for path in folder.iterdir()} - OURS if folder.is_dir() else set()
+    if strange and not (folder / "config.json").exists():
+        raise UserError(f"{folder} is no run (it holds {min(strange)}); use another --name.")
+
+
+def describe(source: Source, chosen: Experiment, schedule: dict[str, Any]) -> dict[str, Any]:
+    """Returns config.json: every setting of the run."""
+    return {
+        "experiment": source.name,
+        "settings": experiment.to_json(experiment.settings(chosen)),
+        "schedule": schedule,
+    }
+
+
+def start(folder: Path, source: Source, settings: dict[str, Any], facts: dict[str, Any]) -> None:
+    """Writes the three files that describe a new run; config.json last, it makes it a run."""
+    shutil.copyfile(source.path, folder / "experiment.py")
+    write_json(folder / "manifest.json", {"run_id": uuid.uuid4().hex[:12]} | facts)
+    write_json(folder / "config.json", settings)
+
+
+def check_same(
+    folder: Path, source: Source, settings: dict[str, Any], facts: dict[str, Any]
+) -> list[str]:
+    """Lists in what this process differs from the one that began the run; empty: exact resume."""
+    found = manifest.differences(read_json(folder / "config.json"), settings)
+    found += manifest.differences(read_json(folder / "manifest.json"), facts)
+    if (folder / "experiment.py").read_bytes() != source.path.read_bytes():
+        found.append(f"experiment.py: {source.path} has been edited")
+    return found
+
+
+def accept_changes(
+    folder: Path, source: Source, settings: dict[str, Any], facts: dict[str, Any], found: list[str]
+) -> None:
+    """Writes down that the run goes on under other conditions, after which update, and as what."""
+    old = read_json(folder / "manifest.json")
+    entry = {"after_update": max(checkpoint.updates(folder / "checkpoints"), default=0)}
+    history = [*old.get("allowed_changes", []), entry | {"changes": found}]
+    kept = {"run_id": old.get("run_id", ""), "allowed_changes": history}
+    shutil.copyfile(source.path, folder / "experiment.py")
+    write_json(folder / "manifest.json", facts | kept)
+    write_json(folder / "config.json", settings)
+
+
+def restore(folder: Path, update: str, say: Say, engine: str = "") -> Run:
+    """Rebuilds a run from its folder alone; changes nothing in it.
+
+    Args:
+      folder: the run.
+      update: "latest", "best" (highest evaluation return), or an update's number.
+      say: told of damaged checkpoints.
+      engine: instead of the run's own, where that one is not at hand.
+    """
+    if not (folder / "config.json").is_file():
+        raise UserError(f"{folder} is no run: it has no config.json.")
+    settings = read_json(folder / "config.json")
+    source = experiment.load(folder / "experiment.py", settings["experiment"])
+    template = experiment.to_json(source.experiment)
+    chosen = experiment.from_json(source.experiment, template | settings["settings"])
+    if engine:
+        chosen = experiment.from_json(chosen, experiment.to_json(chosen) | {"engine": engine})
+    setup = build(chosen)
+    return Run(chosen, setup, _choose(folder / "checkpoints", update, setup, say), settings)
+
+
+def _choose(folder: Path, update: str, setup: Setup, say: Say) -> checkpoint.Saved:
+    abstract = train.abstract_state(*setup[:3])
+    found = checkpoint.updates(folder)
+    if update == "latest":
+        saved = checkpoint.newest(folder, abstract, say, set_aside=False)
+        if saved is None:
+            raise UserError(f"{folder.parent} has no whole checkpoint yet.")
+        return saved
+    number = checkpoint.best_update(folder) if update == "best" else update
+    if number is None:
+        raise UserError(f"No checkpoint in {folder} was taken at an evaluation; try latest.")
+    if str(number) not in map(str, found):
+        valid = ", ".join(["latest", "best", *map(str, found)])
+        raise UserError(f"There is no checkpoint {update!r} in {folder}. Valid: {valid}.")
+    try:
+        return checkpoint.load(folder / f"{int(number):012d}", abstract)
+    except checkpoint.DamagedError as error:
+        raise UserError(f"The checkpoint of update {number} is damaged: {error}.") from error
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Reads a JSON file of the run; UserError if it is missing or broken."""
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read: {one_line(error)}") from error
+
+
+def write_json(path: Path, value: dict[str, Any]) -> None:
+    """Writes a JSON file whole or not at all."""
+    draft = path.with_name(f".{path.name}.draft")
+    try:
+        draft.write_text(json.dumps(value, indent=2) + "\n")
+        draft.replace(path)
+    except OSError as error:
+        raise UserError(f"{path} cannot be written: {error.strerror}.") from error
