@@ -1,0 +1,95 @@
+"""The bodies: dm_control's walkers, each behind one small frozen record."""
+
+import dataclasses
+from collections.abc import Callable
+
+from dm_control import mjcf
+from dm_control.locomotion.walkers import ant as dm_ant
+from dm_control.locomotion.walkers import rodent as dm_rodent
+
+
+@dataclasses.dataclass(frozen=True)
+class Body:
+    """What an environment needs to know of a body beyond its MJCF.
+
+    Names are those of the body's own MJCF, without the prefix that composing gives them.
+    """
+
+    name: str
+    build: Callable[[], mjcf.RootElement]  # a new MJCF model at each call
+    torso: str  # the outermost body: its subtree is the whole walker
+    end_effectors: tuple[str, ...]  # bodies, in dm_control's order
+    ground_geoms: tuple[str, ...]  # geoms that can touch the ground; () means all that collide
+    spawn_height: float  # torso above the ground at rest [m]
+    healthy_height: tuple[float, float]  # torso above the ground, upright and not flying [m]
+    reach: (
+        float  # farthest its ground_geoms get from the torso, with one control step of motion [m]
+    )
+    longest_gap: float  # its own length without the tail: no gap may be wider [m]
+    sight: float  # how far ahead it is told of edges [m]
+    timestep: float  # of physics [s]
+
+
+def _ant_mjcf() -> mjcf.RootElement:
+    return dm_ant.Ant().mjcf_model
+
+
+def _rodent_mjcf() -> mjcf.RootElement:
+    return dm_rodent.Rat().mjcf_model
+
+
+def _both_sides(*names: str) -> tuple[str, ...]:
+    """Replaces the `?` of each name by L and by R."""
+    return tuple(name.replace("?", side) for name in names for side in "LR")
+
+
+ANT = Body(
+    name="ant",
+    build=_ant_mjcf,
+    torso="torso",
+    end_effectors=(
+        "front_left_foot",
+        "front_right_foot",
+        "back_right_foot",
+        "back_left_foot",
+    ),
+    ground_geoms=(),
+    spawn_height=0.522,
+    healthy_height=(0.25, 1.2),
+    reach=1.25,
+    longest_gap=1.0,
+    sight=4.0,
+    timestep=0.005,
+)
+
+# Trunk, head and limbs, one capsule or ellipsoid a part: what the animal can stand or lie on.
+# Not the tail (30 geoms), the small bones of the neck, the teeth, and doubles inside another.
+_RODENT_CORE = (
+    "collision_torso",
+    "collision_pelvis_gut",
+    "vertebra_1_collision",
+    "vertebra_3_collision",
+    "vertebra_5_collision",
+    "vertebra_cervical_3_collision",
+    "skull_0_collision",
+    "skull_F_collision",
+    "jaw_F_collision",
+    *_both_sides("collision_pelvis_?", "upper_leg_?0_collision", "lower_leg_?_collision"),
+    *_both_sides("foot_?_collision", "toe_?0_collision", "toe_?1_collision", "toe_?2_collision"),
+    *_both_sides("humerus_?_collision", "radius_?_collision", "hand_?_collision"),
+    *_both_sides("finger_?0_collision", "finger_?1_collision", "finger_?2_collision"),
+)
+
+RODENT = Body(
+    name="rodent",
+    build=_rodent_mjcf,
+    torso="torso",
+    end_effectors=("lower_arm_R", "lower_arm_L", "foot_R", "foot_L"),
+    ground_geoms=_RODENT_CORE,
+    spawn_height=0.0650895726,
+    healthy_height=(0.03, 0.5),
+    reach=0.24,
+    longest_gap=0.3,
+    sight=1.0,
+    timestep=0.002,
+)
