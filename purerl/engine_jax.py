@@ -1,6 +1,7 @@
 """The `jax` engine: MJX, traced once, with every sum in a fixed order."""
 
 import contextlib
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -36,6 +37,7 @@ class JaxEngine:
             self.model = mjx.put_model(model, impl="jax")
             self.data = mjx.make_data(model, impl="jax")
         self._traces: dict[Any, core.ClosedJaxpr] = {}
+        self._functions: dict[Any, Callable] = {}
 
     def init(self, state: PyTree, changes: dict[str, Array]) -> tuple:
         """Returns the readings at `state` under no control."""
@@ -57,7 +59,11 @@ class JaxEngine:
 
         MJX takes seconds to trace; reset, training and evaluation share one trace.
         """
-        return core.jaxpr_as_fun(self._trace(function, *args))(*jax.tree.leaves(args))
+        closed = self._trace(function, *args)
+        if id(closed) not in self._functions:
+            # jit for a caller who has none: thousands of operations one by one take minutes.
+            self._functions[id(closed)] = jax.jit(core.jaxpr_as_fun(closed), inline=True)
+        return self._functions[id(closed)](*jax.tree.leaves(args))
 
     def _trace(self, function, *args: PyTree) -> core.ClosedJaxpr:
         shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), args)
