@@ -116,6 +116,7 @@ def save(folder: Path, leaves: Leaves, meta: dict[str, Any]) -> Path:
             )
         _flush(path)
     except BaseException:
+        discard(path)
         clean(folder)
         raise
     return path

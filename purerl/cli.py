@@ -49,5 +49,10 @@ def _plain(text: str) -> str:
     """Returns tyro's framed, coloured message as one line."""
     text = re.sub(r"\x1b\[[0-9;]*m", "", text)
     lines = [re.sub(r"[─-╿]+", " ", line).strip() for line in text.splitlines()]
-    lines = [line for line in lines if line and "For full helptext" not in line]
-    return " ".join(" ".join(lines).split()) or "The command line is wrong."
+    plain = " ".join(" ".join(lines).split())
+    plain = re.sub(
+        r"^(Value error|Missing argument|Unrecognized options|Parsing error) ", "", plain
+    )
+    plain = re.sub(r"^Error parsing \w+: ", "", plain)  # a rule of a dataclass, in its own words
+    plain = re.sub(r" *(Argument helptext:|For full helptext).*", "", plain)
+    return plain or "The command line is wrong."

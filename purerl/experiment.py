@@ -59,7 +59,7 @@ class Experiment:
     engine: Annotated[
         Literal["auto", "c", "jax", "warp"],
         tyro.conf.arg(
-            help="Physics engine; auto: c (MuJoCo's C code) where JAX runs on a CPU, else jax (MJX)."
+            help="Physics engine; auto: c (MuJoCo's C code) where JAX is on a CPU, else jax (MJX)."
         ),
     ] = "auto"
     evaluation: Evaluation = Evaluation()

@@ -4,7 +4,9 @@ The same settings give the same bits only under the same manifest, so it is writ
 start, compared on resuming, and its fingerprint stands in every checkpoint.
 """
 
+import ast
 import hashlib
+import importlib.util
 import json
 import os
 import platform
@@ -15,7 +17,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "dm-control", "flax", "optax", "numpy")
+PACKAGES += ("orbax-checkpoint",)
 INFORMATIVE = ("run_id", "git_revision", "git_dirty", "allowed_changes", "host")
 FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE", "JAX_PLATFORMS", "JAX_ENABLE_X64")
 
@@ -76,17 +79,61 @@ def differences(old: Any, new: Any, path: str = "") -> list[str]:
 
 
 def source_hash(builders: Iterable[Callable]) -> str:
-    """Returns a sha256 over the Python source of this package and of the builders' packages."""
-    folders = {Path(__file__).parent}
-    for builder in builders:
-        module = sys.modules.get(getattr(builder, "__module__", ""), None)
-        if module is not None and getattr(module, "__package__", "") and module.__file__:
-            folders.add(Path(module.__file__).parent)
+    """Returns a short sha256 over the source that decides a run's bits.
+
+    That is: every Python file that the algorithm and the builders import from this package or
+    their own, and the bodies (`assets/*.xml`) beside. An edit of a plot or of another environment
+    does not keep a run from resuming.
+    """
+    names = ["purerl.ppo", "purerl.evaluation"]
+    names += [builder.__module__ for builder in builders if hasattr(builder, "__module__")]
+    files = imported_files(names)
+    folders = {file.parent.parent / "assets" for file in files.values()}
+    bodies = {f"assets/{f.name}": f for folder in folders for f in folder.rglob("*.xml")}
     total = hashlib.sha256()
-    # Sorted by what is hashed, not by where it lies: a moved checkout is the same source.
-    for name, file in sorted((f"{d.name}/{f.name}", f) for d in folders for f in d.glob("*.py")):
+    # Sorted by name, not by place: a moved checkout is the same source.
+    for name, file in sorted((files | bodies).items()):
         total.update(name.encode() + b"\0" + file.read_bytes())
-    return total.hexdigest()
+    return total.hexdigest()[:16]
+
+
+def imported_files(names: Iterable[str]) -> dict[str, Path]:
+    """Returns module name -> file, of `names` and all they import from the same packages."""
+    todo = list(names)
+    packages = {name.partition(".")[0] for name in todo}
+    found: dict[str, Path] = {}
+    while todo:
+        name = todo.pop()
+        if name in found or name.partition(".")[0] not in packages:
+            continue
+        file = _module_file(name)
+        if file is not None:
+            found[name] = file
+            todo += _imports(file)
+    return found
+
+
+def _module_file(name: str) -> Path | None:
+    """Returns a module's Python file; None for what is no module, such as an imported function."""
+    if name in sys.modules:
+        file = getattr(sys.modules[name], "__file__", None)
+        return Path(file) if file else None
+    try:
+        spec = importlib.util.find_spec(name)
+    except ModuleNotFoundError:
+        return None
+    return Path(spec.origin) if spec is not None and spec.has_location and spec.origin else None
+
+
+def _imports(file: Path) -> list[str]:
+    """Returns every name that a file's import statements may mean as a module."""
+    names: list[str] = []
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return names
 
 
 def _version(package: str) -> str:

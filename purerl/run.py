@@ -287,8 +287,8 @@ def set_up_jax(cache: bool) -> str:
     if not cache:
         jax.config.update("jax_enable_compilation_cache", False)
         return "off"
-    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    folder = folder or str(Path.home() / ".cache" / "purerl" / "jax")
+    # JAX has read JAX_COMPILATION_CACHE_DIR by now, if it is set.
+    folder = jax.config.jax_compilation_cache_dir or str(Path.home() / ".cache" / "purerl" / "jax")
     jax.config.update("jax_compilation_cache_dir", folder)
     return folder
 

@@ -1,0 +1,71 @@
+"""`python -m purerl.evaluate RUN` works from the run's folder alone."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from purerl import checkpoint, evaluate, run
+from purerl.errors import USAGE
+
+TOY = Path(__file__).parent / "toy_experiment.py"
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    place = tmp_path_factory.mktemp("evaluate")
+    copy = place / "mine.py"
+    copy.write_text(TOY.read_text())
+    words = ["--runs", str(place / "runs"), "--env.steps", "3", "--network.policy-hidden", "5", "6"]
+    assert run.main([str(copy), *words]) == 0
+    copy.unlink()  # the run's own copy must do
+    return place / "runs" / "mine" / "seed1"
+
+
+def result(trained: Path, tmp_path: Path, *words: str) -> dict:
+    file = tmp_path / "result.json"
+    assert evaluate.main([str(trained), "--episodes", "6", "--json", str(file), *words]) == 0
+    return json.loads(file.read_text())
+
+
+def test_it_reports_every_metric_under_the_runs_own_settings(trained, tmp_path, capsys):
+    found = result(trained, tmp_path)
+    assert found["episodes"] == 6 and found["update"] == 12 and found["steps"] == 384
+    assert found["metrics"]["episode_length"]["mean"] == 3.0  # the override, not the file's 4
+    values = found["metrics"]["episode_return"]["values"]
+    assert len(values) == 6
+    assert found["metrics"]["episode_return"]["mean"] == pytest.approx(sum(values) / 6)
+    said = capsys.readouterr().out
+    assert "N = 6 episodes" in said and "reward_mean" in said and "std" in said
+
+
+def test_equal_seeds_give_equal_episodes(trained, tmp_path):
+    first = result(trained, tmp_path, "--stochastic")["metrics"]
+    assert first == result(trained, tmp_path, "--stochastic")["metrics"]
+    assert first != result(trained, tmp_path, "--stochastic", "--seed", "1")["metrics"]
+    assert first != result(trained, tmp_path)["metrics"]
+
+
+def test_a_checkpoint_can_be_chosen(trained, tmp_path, capsys):
+    updates = checkpoint.updates(trained / "checkpoints")
+    assert result(trained, tmp_path, "--checkpoint", str(updates[0]))["update"] == updates[0]
+    assert result(trained, tmp_path, "--checkpoint", "best")["update"] in updates
+    assert evaluate.main([str(trained), "--checkpoint", "5000"]) == USAGE
+    assert f"Valid: latest, best, {updates[0]}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["/nowhere"], ["/nowhere", "--episods", "3"], []])
+def test_a_mistake_is_one_line(words, capsys):
+    assert evaluate.main(words) == USAGE
+    said = capsys.readouterr().err
+    assert len(said.strip().splitlines()) == 1 and "Traceback" not in said
+
+
+def test_settings_that_do_not_fit_the_file_are_named(trained, tmp_path, capsys):
+    copy = tmp_path / "run"
+    checkpoint.shutil.copytree(trained, copy)
+    settings = json.loads((copy / "config.json").read_text())
+    settings["settings"]["env"]["gravity"] = 9.81
+    (copy / "config.json").write_text(json.dumps(settings))
+    assert evaluate.main([str(copy)]) == USAGE
+    assert "env.gravity" in capsys.readouterr().err

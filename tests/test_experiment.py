@@ -1,0 +1,78 @@
+"""Experiments are found by name, path or module, and survive a round trip through JSON."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from purerl import experiment
+from purerl.errors import UserError
+
+TOY = Path(__file__).parent / "toy_experiment.py"
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    (tmp_path / "experiments").mkdir()
+    (tmp_path / "experiments" / "hopper.py").write_text(TOY.read_text())
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_an_experiment_is_found_by_name_path_and_module(place):
+    for name, expected in [
+        ("hopper", "hopper"),
+        ("experiments/hopper.py", "hopper"),
+        ("tests.toy_experiment", "toy_experiment"),
+    ]:
+        source = experiment.find(name)
+        assert source.name == expected and source.experiment.env.steps == 4
+    assert "hopper" in experiment.available()
+
+
+@pytest.mark.parametrize("name", ["hoper", "experiments/none.py", "tests.none_such", "no_such.x"])
+def test_an_unknown_experiment_is_one_line(place, name):
+    with pytest.raises(UserError) as error:
+        experiment.find(name)
+    assert "\n" not in str(error.value)
+    if name == "hoper":
+        assert "Did you mean hopper?" in str(error.value)
+
+
+def test_a_mistake_in_the_file_names_its_line(tmp_path):
+    for text, message in [
+        ("x = 1\ny = 1 / 0\n", "line 2: ZeroDivisionError"),
+        ("x = = 1\n", "line 1"),
+        ("x = 1\n", "defines no `experiment"),
+    ]:
+        (tmp_path / "bad.py").write_text(text)
+        with pytest.raises(UserError, match=message):
+            experiment.load(tmp_path / "bad.py")
+
+
+def test_settings_survive_json():
+    chosen = experiment.load(TOY).experiment
+    network = dataclasses.replace(chosen.network, policy_hidden=(5, 6))
+    changed = dataclasses.replace(chosen, seed=7, network=network)
+    values = json.loads(json.dumps(experiment.to_json(changed)))
+    assert experiment.from_json(chosen, values) == changed
+
+
+def test_missing_and_unknown_settings_are_named():
+    chosen = experiment.load(TOY).experiment
+    values = experiment.to_json(chosen)
+    del values["env"]["steps"]
+    with pytest.raises(UserError, match="lacks env.steps"):
+        experiment.from_json(chosen, values)
+    values = experiment.to_json(chosen)
+    values["ppo"]["learning_rat"] = 1.0
+    with pytest.raises(UserError, match="ppo.learning_rat'.*Did you mean ppo.learning_rate"):
+        experiment.from_json(chosen, values)
+
+
+def test_a_setting_that_json_cannot_hold_is_named():
+    chosen = experiment.load(TOY).experiment
+    env = dataclasses.replace(chosen.env, name=len)
+    with pytest.raises(UserError, match=r"env.name is a builtin_function"):
+        experiment.to_json(dataclasses.replace(chosen, env=env))

@@ -1,0 +1,347 @@
+"""The run command: the same bits however it is interrupted, and one line for every mistake."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from purerl import checkpoint, recorder, run, train
+from purerl.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
+from purerl.experiment import Evaluation, load
+
+TOY = Path(__file__).parent / "toy_experiment.py"
+ROOT = TOY.parent.parent
+LONG = ["--ppo.num-steps", "12800", "--checkpoints", "40"]  # 400 updates: seconds
+
+
+def start(runs: Path, *words: str) -> int:
+    return run.main([str(TOY), "--runs", str(runs), *words])
+
+
+def folder(runs: Path, name: str = "seed1") -> Path:
+    return runs / "toy_experiment" / name
+
+
+def lines(runs: Path, name: str = "seed1") -> list[dict]:
+    """Returns metrics.jsonl without the clock."""
+    text = (folder(runs, name) / "metrics.jsonl").read_text()
+    return [
+        {k: v for k, v in json.loads(line).items() if k != "wall_s"} for line in text.splitlines()
+    ]
+
+
+def digest(runs: Path, name: str = "seed1") -> str:
+    return lines(runs, name)[-1]["digest"]
+
+
+def spawn(runs: Path, *words: str) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-m", "purerl.run", str(TOY), "--runs", str(runs), *words],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=os.environ | {"JAX_COMPILATION_CACHE_DIR": str(runs / "cache")},
+    )  # fmt: skip
+
+
+def wait_for(condition, process: subprocess.Popen, timeout: float = 60.0) -> None:
+    end = time.monotonic() + timeout
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def checkpoints(runs: Path) -> list[int]:
+    return checkpoint.updates(folder(runs) / "checkpoints")
+
+
+class Stopper:
+    """Asks to stop at the n-th question."""
+
+    def __init__(self, questions: int) -> None:
+        self.left = questions
+
+    def __call__(self) -> bool:
+        self.left -= 1
+        return self.left < 0
+
+
+@pytest.fixture
+def stop_after(monkeypatch):
+    """Makes the next run stop by itself after some questions."""
+
+    def use(questions: int) -> None:
+        monkeypatch.setattr(run, "stop_signals", lambda: run.contextmanager(one)(questions))
+
+    def one(questions):
+        yield Stopper(questions)
+
+    return use
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """A run that nobody disturbed."""
+    runs = tmp_path_factory.mktemp("whole")
+    assert start(runs, "--checkpoints", "4") == SUCCESS
+    return runs
+
+
+def test_a_run_writes_what_it_should_and_no_more_steps_than_promised(whole):
+    written = lines(whole)
+    assert [line["update"] for line in written] == list(range(1, 13))
+    assert written[-1]["steps"] == 384  # of 399: whole updates of 32 only
+    assert [line["update"] for line in written if "digest" in line] == [3, 6, 9, 12]
+    assert [line["update"] for line in written if "eval/episode_return" in line] == [6, 12]
+    assert written[-1]["eval/episode_length"] == 4.0
+    saved = checkpoint.load_meta(folder(whole) / "checkpoints" / f"{12:012d}")
+    assert saved["digest"] == digest(whole) and saved["steps"] == 384
+    assert saved["metrics_bytes"] == (folder(whole) / "metrics.jsonl").stat().st_size
+    assert (folder(whole) / "experiment.py").read_text() == TOY.read_text()
+    facts = json.loads((folder(whole) / "manifest.json").read_text())
+    assert facts["versions"]["jax"] and facts["device"]["platform"] and facts["engine"] != "auto"
+
+
+def test_intervals_do_not_change_a_bit(whole, tmp_path):
+    words = ["--log-every", "5", "--checkpoints", "1", "--evaluation.number", "0", "--tensorboard"]
+    assert start(tmp_path, *words) == SUCCESS
+    assert digest(tmp_path) == digest(whole)
+    assert [line["update"] for line in lines(tmp_path)] == [5, 10, 12]
+
+
+def test_another_seed_is_another_run(whole, tmp_path):
+    assert start(tmp_path, "--seed", "2", "--name", "x") == SUCCESS
+    assert digest(tmp_path, "x") != digest(whole)
+
+
+@pytest.mark.parametrize("questions", [1, 2, 7, 14, 20])
+def test_stopped_and_resumed_is_the_same_run(whole, tmp_path, stop_after, questions):
+    stop_after(questions)
+    assert start(tmp_path, "--checkpoints", "4") == INTERRUPTED
+    assert len(lines(tmp_path)) < 12
+    stop_after(10**9)
+    assert start(tmp_path, "--checkpoints", "4", "--resume") == SUCCESS
+    assert lines(tmp_path) == lines(whole)
+    clocks = [
+        json.loads(line)["wall_s"]
+        for line in (folder(tmp_path) / "metrics.jsonl").read_text().splitlines()
+    ]
+    assert clocks == sorted(clocks) and clocks[0] > 0  # one clock through both lives
+
+
+def test_a_stop_message_says_how_to_go_on(tmp_path, stop_after, capsys):
+    stop_after(3)
+    start(tmp_path)
+    said = capsys.readouterr().err
+    assert f"python -m purerl.run {TOY} --runs {tmp_path} --resume" in said
+    assert "Traceback" not in said
+
+
+def test_resuming_a_finished_run_only_says_so(whole, capsys):
+    assert start(whole, "--checkpoints", "4", "--resume") == SUCCESS
+    assert f"Already done: 12 updates. Digest {digest(whole)}" in capsys.readouterr().out
+
+
+def test_a_damaged_checkpoint_is_told_and_the_run_is_still_the_same(
+    whole, tmp_path, stop_after, capsys
+):
+    stop_after(14)
+    start(tmp_path, "--checkpoints", "4")
+    newest = folder(tmp_path) / "checkpoints" / f"{checkpoints(tmp_path)[-1]:012d}"
+    file = newest / "meta" / "metadata"
+    file.write_text(file.read_text()[:-20])
+    stop_after(10**9)
+    assert start(tmp_path, "--checkpoints", "4", "--resume") == SUCCESS
+    assert lines(tmp_path) == lines(whole)
+    assert "is damaged: its metadata cannot be read" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("signals", [[signal.SIGKILL], [signal.SIGTERM]])
+def test_a_killed_process_resumes_to_the_same_bits(tmp_path, signals):
+    process = spawn(tmp_path, *LONG)
+    wait_for(lambda: len(checkpoints(tmp_path)) >= 3, process)
+    for number in signals:
+        process.send_signal(number)
+    _, said = process.communicate(timeout=60)
+    if signals == [signal.SIGTERM]:
+        assert process.returncode == INTERRUPTED, said
+        assert "--resume" in said and "Traceback" not in said
+    else:
+        assert process.returncode == -signal.SIGKILL
+    assert checkpoints(tmp_path)[-1] < 400
+    process = spawn(tmp_path, *LONG, "--resume")
+    said, wrong = process.communicate(timeout=120)
+    assert process.returncode == SUCCESS, wrong
+    assert "Resuming after update" in said
+    process = spawn(tmp_path, *LONG, "--name", "undisturbed")
+    assert process.wait(120) == SUCCESS
+    assert lines(tmp_path) == lines(tmp_path, "undisturbed")
+    assert digest(tmp_path) in said
+
+
+def test_a_second_process_is_refused_with_the_first_ones_number(tmp_path):
+    first = spawn(tmp_path, *LONG)
+    try:
+        wait_for((folder(tmp_path) / "config.json").exists, first)
+        second = spawn(tmp_path, *LONG, "--resume")
+        _, said = second.communicate(timeout=60)
+        assert second.returncode == USAGE
+        assert f"being written by process {first.pid}" in said and "Traceback" not in said
+    finally:
+        first.kill()
+        first.communicate()
+
+
+def test_a_full_disk_does_not_stop_training(whole, tmp_path, monkeypatch, capsys):
+    save = checkpoint.save
+
+    def sometimes(where, leaves, meta):
+        if meta["update"] in (3, 6):
+            raise OSError(28, "No space left on device")
+        return save(where, leaves, meta)
+
+    monkeypatch.setattr(recorder.checkpoint, "save", sometimes)
+    assert start(tmp_path, "--checkpoints", "4") == SUCCESS
+    said = capsys.readouterr().out
+    assert said.count("could not be saved") == 2 and "No space left" in said
+    assert checkpoints(tmp_path) == [9, 12]
+    assert lines(tmp_path) == lines(whole)
+
+
+def test_a_last_checkpoint_that_fails_is_an_error(tmp_path, monkeypatch, capsys):
+    def never(where, leaves, meta):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(recorder.checkpoint, "save", never)
+    assert start(tmp_path) == FAILURE
+    assert "The last checkpoint could not be saved" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("fault", ["skipped", "parameters"])
+def test_non_finite_learning_stops_and_is_never_saved(tmp_path, monkeypatch, capsys, fault):
+    advance = train.advance
+
+    def broken(programs, state, number):
+        state, window = advance(programs, state, number)
+        if int(state.update) >= 6 and fault == "skipped":
+            window[-1] = window[-1] | {"skipped_in_a_row": np.float32(10)}
+        if int(state.update) == 6 and fault == "parameters":
+            state = state.replace(params=train.jax.tree.map(lambda x: x * np.nan, state.params))
+        return state, window
+
+    monkeypatch.setattr(train, "advance", broken)
+    assert start(tmp_path, "--checkpoints", "4") == FAILURE
+    said = capsys.readouterr().err
+    assert "Update 6" in said and f"{3:012d}" in said and "Traceback" not in said
+    assert checkpoints(tmp_path) == [3]
+
+
+def test_a_failing_logger_does_not_stop_training(whole, tmp_path, monkeypatch, capsys):
+    from purerl import loggers
+
+    def fail(self, record):
+        raise RuntimeError("the server is on fire")
+
+    pytest.importorskip("tensorboardX")
+    monkeypatch.setattr(loggers.TensorBoardSink, "log", fail)
+    assert start(tmp_path, "--checkpoints", "4", "--tensorboard") == SUCCESS
+    assert capsys.readouterr().out.count("TensorBoard logger is dropped") == 1
+    assert lines(tmp_path) == lines(whole)
+
+
+def refused(capsys, code: int) -> str:
+    """Returns the message of a refused command, checked to be for a person."""
+    said = capsys.readouterr().err
+    assert code == USAGE, said
+    assert "Traceback" not in said
+    return said
+
+
+def test_an_existing_run_is_not_overwritten(whole, capsys):
+    before = (folder(whole) / "metrics.jsonl").read_bytes()
+    assert "use --resume" in refused(capsys, start(whole))
+    assert (folder(whole) / "metrics.jsonl").read_bytes() == before
+
+
+def test_a_folder_that_is_no_run_is_not_written_to(tmp_path, capsys):
+    folder(tmp_path).mkdir(parents=True)
+    (folder(tmp_path) / "thesis.tex").write_text("")
+    assert "thesis.tex" in refused(capsys, start(tmp_path))
+
+
+def test_a_run_begun_under_other_conditions_lists_them(tmp_path, stop_after, capsys):
+    stop_after(9)
+    start(tmp_path)
+    file = folder(tmp_path) / "manifest.json"
+    facts = json.loads(file.read_text())
+    facts["versions"]["jax"] = "0.0.1"
+    file.write_text(json.dumps(facts))
+    capsys.readouterr()
+    words = ["--resume", "--ppo.learning-rate", "1e-3"]
+    said = refused(capsys, start(tmp_path, *words))
+    assert "versions.jax: 0.0.1 -> " in said
+    assert "settings.ppo.learning_rate: 0.0003 -> 0.001" in said
+    stop_after(10**9)
+    assert start(tmp_path, *words, "--allow-changes") == SUCCESS
+    allowed = json.loads(file.read_text())["allowed_changes"]
+    assert allowed[0]["after_update"] > 0 and len(allowed[0]["changes"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--resume"], "no run .* to resume"),
+        (["--ppo.learing-rate", "1"], "Did you mean --ppo.learning-rate"),
+        (["--ppo.learning-rate", "fast"], "could not convert"),
+        (["--ppo.num-steps", "31"], "num_steps is 31, less than one update"),
+        (["--ppo.num-minibatches", "3"], "does not divide"),
+        (["--engine", "warp"], "warp"),
+        (["--keep", "0"], "keep is 0"),
+        (["--runs", "/dev/null/runs"], "cannot be written"),
+    ],
+)
+def test_a_mistake_is_one_line(tmp_path, capsys, words, message):
+    said = refused(capsys, start(tmp_path, *words))
+    assert len(said.strip().splitlines()) == 1
+    import re
+
+    assert re.search(message, said), said
+    assert not (tmp_path / "toy_experiment").exists()
+
+
+def test_an_unknown_experiment_is_one_line(capsys):
+    said = refused(capsys, run.main(["no_such"]))
+    assert len(said.strip().splitlines()) == 1
+
+
+def test_help_needs_no_jax():
+    code = (
+        "import sys; from purerl import run; assert run.main(['--help']) == 0; "
+        "assert 'jax' not in sys.modules and 'mujoco' not in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "--resume" in done.stdout and "Exit codes" in done.stdout
+
+
+@pytest.mark.parametrize("number", [0, 1, 3, 7, 50])
+@pytest.mark.parametrize("every", [1, 4, 9, 20])
+def test_events_are_spread_over_the_run_and_end_with_it(number, every):
+    ticks = train.evenly(number, 20, every)
+    assert all(tick % every == 0 or tick == 20 for tick in ticks)
+    assert list(ticks) == sorted(set(ticks)) and len(ticks) <= number
+    assert ticks[-1:] == ((20,) if number else ())
+    if every == 1 and number == 7:
+        assert ticks == (3, 6, 9, 12, 15, 18, 20)
+
+
+def test_the_plan_never_exceeds_the_budget():
+    config = load(TOY).experiment.ppo
+    plan = train.make_plan(config, Evaluation(), 0, 0)
+    assert plan.steps == 384 <= config.num_steps < 384 + plan.steps_per_update
+    assert plan.checkpoints == (12,)
