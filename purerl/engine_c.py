@@ -5,6 +5,7 @@ saves the row, and its results do not depend on the number of threads: the callb
 function of its arguments, which is what `jax.pure_callback` asks for.
 """
 
+import copy
 import functools
 import math
 import threading
@@ -74,8 +75,21 @@ class CEngine:
     def batch(self, number: int, names: tuple[str, ...]) -> Batch:
         """Returns the simulations for `number` environments with the changed fields `names`."""
         if (number, names) not in self.batches:
-            self.batches[number, names] = Batch(self.model, number)
+            self.batches[number, names] = Batch(_movable(self.model, names), number)
         return self.batches[number, names]
+
+
+def _movable(model: mujoco.MjModel, names: tuple[str, ...]) -> mujoco.MjModel:
+    """Returns a model that heeds changed frames.
+
+    The compiler marks geoms and sites that coincide with their body (`geom_sameframe`), and MuJoCo
+    then never reads their own frame, which would make a change of it do nothing.
+    """
+    if not any(n.endswith(("_pos", "_quat", "_ipos", "_iquat")) for n in names):
+        return model
+    model = copy.copy(model)
+    model.geom_sameframe[:] = model.site_sameframe[:] = model.body_sameframe[:] = 0
+    return model
 
 
 def _as_matrix(name: str, value: Array) -> Array:

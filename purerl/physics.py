@@ -62,7 +62,8 @@ class Physics:
     `changes` maps MjModel field names to this simulation's values, of the field's own shape
     (`{"geom_friction": [ngeom, 3]}`). Fields are set as they are: constants that the model
     compiler derives from them (`body_invweight0`, `body_subtreemass`, ... of `mj_setConst`) do not
-    follow, on any engine; change those beside them where it matters.
+    follow, on any engine; change those beside them where it matters (for the mass of a lone free
+    body `dof_M0` too, which the C code reads).
 
     A simulation that blows up, or is given NaN, returns NaN and touches no other.
     """
