@@ -1,0 +1,266 @@
+"""Run forward: the ant or the rodent, on a floor or across a corridor with gaps.
+
+The speed that is rewarded is that of the walker's own centre of mass (the torso's subtree), never
+the arena's. One episode's corridor and its random changes of the model are data in `state.task`,
+drawn by `reset`, so that every environment has its own and a checkpoint holds them.
+"""
+
+import dataclasses
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.arenas import (
+    Floor,
+    GapsCorridor,
+    course_changes,
+    distances_to_next_edges,
+    draw_course,
+    gaps_crossed,
+)
+from envs.bodies import ANT, RODENT
+from envs.compose import Composed, compose
+from purerl import model as lookup
+from purerl.env import State
+from purerl.physics import Physics, PhysicsState
+from purerl.types import Array
+
+BODIES = {"ant": ANT, "rodent": RODENT}
+READINGS = ("xpos", "xmat", "subtree_com", "actuator_force")
+BODY_READINGS = ("cinert", "cvel")
+
+
+@dataclasses.dataclass(frozen=True)
+class Randomization:
+    """Factors on the model's own values, drawn uniformly once an episode; (1, 1) changes nothing."""
+
+    friction: tuple[float, float] = (1.0, 1.0)
+    """Sliding friction of every geom."""
+    mass: tuple[float, float] = (1.0, 1.0)
+    """Mass and inertia of every body, by one factor."""
+    gear: tuple[float, float] = (1.0, 1.0)
+    """Strength of every actuator, by one factor."""
+
+    def __post_init__(self):
+        """Refuses ranges that make no sense."""
+        for name in ("friction", "mass", "gear"):
+            low, high = getattr(self, name)
+            if not 0.0 < low <= high:
+                raise ValueError(f"{name} is {(low, high)}; give factors 0 < least <= greatest.")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Settings of the task."""
+
+    body: Literal["ant", "rodent"] = "ant"
+    """Which of dm_control's walkers."""
+    arena: Literal["floor", "gaps"] = "floor"
+    """An endless floor, or a corridor whose gaps differ in every episode."""
+    platform_length: tuple[float, float] = (1.5, 2.0)
+    """Gaps only: least and greatest length of a platform [m]."""
+    gap_length: tuple[float, float] = (0.05, 0.2)
+    """Gaps only: least and greatest length of a gap [m]."""
+    reward: Literal["speed", "target"] = "speed"
+    """The weighted terms below, or dm_control's corridor reward: speed / target_speed in [0, 1]."""
+    target_speed: float = 1.0
+    """Speed that earns the whole of the target reward [m/s]."""
+    forward_weight: float = 5.0
+    """Reward for 1 m/s of the walker's centre of mass along x, per control step."""
+    distance_weight: float = 1.0
+    """Reward for each metre gained along x."""
+    healthy_reward: float = 0.5
+    """Reward for each control step that ends healthy."""
+    control_weight: float = 0.1
+    """Reward taken for the sum of squared actions."""
+    healthy_up: float = 0.0
+    """Least z of the torso's up-axis: below, the body lies on its back, which ends the episode."""
+    reset_noise: float = 0.01
+    """Half-width of the start's noise [rad, m/s, rad/s]."""
+    substeps: int = 5
+    """Physics steps in one control step."""
+    observe_place: bool = False
+    """Whether x and y of the torso can be felt (y always is in a corridor)."""
+    observe_bodies: bool = False
+    """Whether inertia and velocity of every body (`cinert`, `cvel`) can be felt."""
+    randomization: Randomization = Randomization()
+    """What differs between episodes beside the corridor."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """The environment; `build` makes one."""
+
+    options: Options
+    physics: Physics
+    parts: Composed
+    joints: tuple[int, ...]  # of qpos
+    dofs: tuple[int, ...]  # of qvel
+    action_size: int
+
+    @property
+    def control_timestep(self) -> float:
+        """Simulated time of one step [s]."""
+        return self.physics.control_timestep
+
+    def reset(self, key: Array) -> State:
+        """Starts standing, limbs and velocities drawn around rest, in a corridor of its own."""
+        limbs_key, velocity_key, course_key, model_key = jax.random.split(key, 4)
+        model, noise = self.physics.model, self.options.reset_noise
+        limbs = jax.random.uniform(limbs_key, (len(self.joints),), minval=-noise, maxval=noise)
+        qvel = jax.random.uniform(velocity_key, (model.nv,), minval=-noise, maxval=noise)
+        qpos = jnp.asarray(model.qpos0, jnp.float32).at[jnp.array(self.joints)].add(limbs)
+        task = {"factors": draw_factors(model_key, self.options.randomization)}
+        if isinstance(self.parts.arena, GapsCorridor):
+            task["course"] = draw_course(course_key, self.parts.arena)
+            task["crossed"] = jnp.zeros((), jnp.int32)
+        physics, readings = self.physics.init(qpos, qvel, self._changes(task, qpos[0]))
+        center = readings.subtree_com[self.parts.torso, 0]
+        return self._state(physics, readings, task, center, jnp.zeros(self.action_size))
+
+    def step(self, state: State, action: Array) -> State:
+        """Drives the actuators with action [A] in [-1, 1]."""
+        ctrl = lookup.scale_action(self.physics.model, action)
+        changes = self.model_changes(state)
+        physics, readings = self.physics.step(state.physics, ctrl, changes)
+        return self._state(physics, readings, state.task, state.task["center"], action)
+
+    def model_changes(self, state: State) -> dict[str, Array]:
+        """Returns this episode's model fields where the body is now (a video needs them too)."""
+        return self._changes(state.task, state.physics.qpos[0])
+
+    def _changes(self, task: dict[str, Any], x: Array) -> dict[str, Array]:
+        changes = randomized_fields(self.physics.model, self.options.randomization, task["factors"])
+        if "course" in task:
+            reach = self.parts.body.reach
+            changes |= course_changes(self.parts.boxes, task["course"], x, reach)
+        return changes
+
+    def _state(
+        self, physics: PhysicsState, readings: Any, task: dict, before: Array, action: Array
+    ) -> State:
+        """Makes the state after a step that moved the centre of mass from x = `before` [m]."""
+        torso, center = self.parts.torso, readings.subtree_com[self.parts.torso, 0]
+        speed = (center - before) / self.control_timestep
+        height, up = readings.xpos[torso, 2], readings.xmat[torso, 2, 2]
+        low, high = self.parts.body.healthy_height
+        healthy = (height > low) & (height < high) & (up > self.options.healthy_up)
+        terms = reward_terms(self.options, speed, center - before, healthy, action)
+        metrics = {"forward_velocity": speed, "height": height, "up": up}
+        metrics |= {f"reward_{name}": term for name, term in terms.items()}
+        task = task | {"center": center}
+        if "course" in task:
+            crossed = jnp.maximum(gaps_crossed(task["course"], physics.qpos[0]), task["crossed"])
+            # A body below its healthy height has fallen in, however far it flew.
+            crossed = jnp.where(healthy, crossed, task["crossed"])
+            metrics["gaps_crossed_count"] = (crossed - task["crossed"]).astype(jnp.float32)
+            task |= {"crossed": crossed}
+        return State(
+            physics=physics,
+            observation=self._observe(physics, readings, task, action),
+            reward=sum(terms.values()),
+            terminated=~healthy,
+            truncated=jnp.zeros((), bool),
+            metrics=metrics,
+            task=task,
+        )
+
+    def _observe(self, physics: PhysicsState, readings: Any, task: dict, action: Array) -> Array:
+        """Returns [O]: posture and motion in the torso's own frame, forces, and what lies ahead."""
+        torso = self.parts.torso
+        to_body = readings.xmat[torso].T
+        ends = readings.xpos[jnp.array(self.parts.end_effectors)] - readings.xpos[torso]
+        parts = [
+            readings.xpos[torso, 2:],
+            readings.xmat[torso].ravel(),
+            physics.qpos[jnp.array(self.joints)],
+            to_body @ physics.qvel[:3],
+            physics.qvel[3:6],  # MuJoCo keeps a free joint's rotation in the body's own frame
+            physics.qvel[jnp.array(self.dofs)],
+            (ends @ to_body.T).ravel(),
+            readings.actuator_force,
+            physics.act,
+            action,
+        ]
+        if self.options.observe_place:
+            parts.append(physics.qpos[:2])
+        if self.options.observe_bodies:
+            parts += [readings.cinert[1:].ravel(), readings.cvel[1:].ravel()]
+        if "course" in task:
+            sight = self.parts.body.sight
+            edges = distances_to_next_edges(task["course"], physics.qpos[0], 6, sight)
+            parts += [physics.qpos[1:2], edges]
+        return jnp.concatenate(parts)
+
+
+def reward_terms(
+    options: Options, speed: Array, distance: Array, healthy: Array, action: Array
+) -> dict[str, Array]:
+    """Returns the reward as its terms, [] each: speed [m/s], distance [m], health, control cost.
+
+    The target reward is dm_control's for its corridors: linear up to the target speed, then flat.
+    """
+    if options.reward == "target":
+        return {"target": jnp.clip(speed / options.target_speed, 0.0, 1.0)}
+    return {
+        "forward": options.forward_weight * speed,
+        "distance": options.distance_weight * distance,
+        "healthy": options.healthy_reward * healthy.astype(jnp.float32),
+        "control": -options.control_weight * jnp.sum(jnp.square(action)),
+    }
+
+
+def draw_factors(key: Array, randomization: Randomization) -> dict[str, Array]:
+    """Draws an episode's factors, name -> [], for the ranges that leave a choice."""
+    factors = {}
+    for number, (name, (low, high)) in enumerate(dataclasses.asdict(randomization).items()):
+        if low < high:
+            # By number, so that switching one range on leaves the other draws as they are.
+            draw = jax.random.fold_in(key, number)
+            factors[name] = jax.random.uniform(draw, (), minval=low, maxval=high)
+        elif low != 1.0:
+            factors[name] = jnp.asarray(low, jnp.float32)
+    return factors
+
+
+def randomized_fields(
+    model: Any, randomization: Randomization, factors: dict[str, Array]
+) -> dict[str, Array]:
+    """Returns the model fields that an episode's factors change.
+
+    Weights that the compiler derives from masses for the constraint solver (`*_invweight0`) stay:
+    they set its regularisation, not the masses.
+    """
+    fields = {
+        "friction": ("geom_friction",),
+        "mass": ("body_mass", "body_inertia", "body_subtreemass"),
+        "gear": ("actuator_gear",),
+    }
+    changes = {}
+    for name, factor in factors.items():
+        for field in fields[name]:
+            own = jnp.asarray(getattr(model, field), jnp.float32)
+            # Of the three numbers of a friction only the first slides.
+            sliding = np.array([1.0, 0.0, 0.0], np.float32)
+            changes[field] = own * (1 + (factor - 1) * sliding) if name == "friction" else own * factor
+    return changes
+
+
+def build(options: Options = Options(), engine: str = "auto") -> Run:  # noqa: B008
+    """Builds the environment on an engine of `purerl.physics`."""
+    body = BODIES[options.body]
+    corridor = GapsCorridor(options.platform_length, options.gap_length)
+    parts = compose(body, corridor if options.arena == "gaps" else Floor(), engine)
+    model = parts.model
+    joints = [lookup.names(model, "joint")[i] for i in parts.joints]
+    readings = READINGS + (BODY_READINGS if options.observe_bodies else ())
+    return Run(
+        options=options,
+        physics=Physics(model, readings, options.substeps, engine),
+        parts=parts,
+        joints=tuple(lookup.qpos_indices(model, joints).tolist()),
+        dofs=tuple(lookup.qvel_indices(model, joints).tolist()),
+        action_size=model.nu,
+    )

@@ -1,0 +1,28 @@
+"""dm_control's ant runs forward on a floor.
+
+    python -m purerl.run ant_run
+"""
+
+from envs import ant_run
+from purerl import networks
+from purerl.config import Config
+from purerl.experiment import Evaluation, Experiment
+
+experiment = Experiment(
+    build_env=ant_run.build,
+    env=ant_run.Options(),
+    build_network=networks.mlp,
+    network=networks.MlpOptions(policy_hidden=(128, 128), value_hidden=(256, 256)),
+    ppo=Config(
+        num_steps=10_000_000,
+        num_envs=256,
+        rollout_length=32,
+        num_epochs=4,
+        num_minibatches=8,
+        learning_rate=3e-4,
+        schedule="adaptive_kl",
+        gamma=0.98,
+        reward_scale=0.1,
+    ),
+    evaluation=Evaluation(num_episodes=32, number=10),
+)

@@ -1,0 +1,26 @@
+"""Cart-pole swing-up: the smallest task worth learning, and the first thing to run.
+
+    python -m purerl.run cartpole_swingup
+"""
+
+from envs import cartpole_swingup
+from purerl import networks
+from purerl.config import Config
+from purerl.experiment import Evaluation, Experiment
+
+experiment = Experiment(
+    build_env=cartpole_swingup.build,
+    env=cartpole_swingup.Options(),
+    build_network=networks.mlp,
+    network=networks.MlpOptions(policy_hidden=(64, 64), value_hidden=(64, 64), activation="tanh"),
+    ppo=Config(
+        num_steps=1_000_000,
+        num_envs=64,
+        rollout_length=64,
+        num_epochs=6,
+        num_minibatches=8,
+        learning_rate=1e-3,
+        schedule="linear",
+    ),
+    evaluation=Evaluation(num_episodes=32, number=5),
+)
