@@ -19,7 +19,7 @@ from typing import Any
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "dm-control", "flax", "optax", "numpy")
 PACKAGES += ("orbax-checkpoint",)
-INFORMATIVE = ("run_id", "git_revision", "git_dirty", "allowed_changes", "host")
+INFORMATIVE = ("run_id", "git_revision", "git_dirty", "allowed_changes")
 FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE", "JAX_PLATFORMS", "JAX_ENABLE_X64")
 
 
@@ -43,7 +43,6 @@ def collect(engine: str, builders: Iterable[Callable]) -> dict[str, Any]:
         "threefry_partitionable": bool(jax.config.jax_threefry_partitionable),
         "flags": {name: os.environ[name] for name in FLAGS if name in os.environ},
         "source": source_hash(builders),
-        "host": platform.node(),
     } | _git(Path(__file__).parent)
     found["device"]["count"] = jax.device_count()
     if device.platform == "cpu":  # XLA's pool size changes the bits of matrix products on a CPU

@@ -237,6 +237,9 @@ def begin_or_go_on(
         return
     found = rundir.check_same(folder, source, settings, facts)
     if found and not allow_changes:
+        pin = "device.threads"  # a CPU's bits depend on the size of XLA's thread pool
+        threads = [line.split()[1] for line in found if line.startswith(pin)]
+        found += [f"(NPROC={number} brings {pin} back)" for number in threads]
         raise UserError(
             f"The run {folder} was begun under other conditions, so it would not go on exactly:\n  "
             + "\n  ".join(found)

@@ -11,12 +11,13 @@ from purerl.loggers import BackgroundLogger, MetricsFile, TensorBoardSink, summa
 
 
 def test_counts_are_summed_and_episodes_weigh_by_their_number():
-    window = [
-        {"episodes": 1.0, "episode_return": 10.0, "episode/x": 1.0, "kl": 1.0, "skipped_in_a_row": 4.0},
-        {"episodes": 3.0, "episode_return": 2.0, "episode/x": 5.0, "kl": 2.0, "skipped_in_a_row": 0.0},
-        {"episodes": 0.0, "episode_return": float("nan"), "episode/x": 0.0, "kl": 6.0,
-         "skipped_in_a_row": 2.0},
-    ]  # fmt: skip
+    names = ("episodes", "episode_return", "episode/x", "kl", "skipped_in_a_row")
+    rows = [
+        (1.0, 10.0, 1.0, 1.0, 4.0),
+        (3.0, 2.0, 5.0, 2.0, 0.0),
+        (0.0, float("nan"), 0.0, 6.0, 2.0),
+    ]
+    window = [dict(zip(names, row, strict=True)) for row in rows]
     assert summarize(window) == {
         "episodes": 4.0,
         "episode_return": 4.0,
