@@ -91,5 +91,5 @@ RODENT = Body(
     reach=0.24,
     longest_gap=0.3,
     sight=1.0,
-    timestep=0.002,
+    timestep=0.004,
 )

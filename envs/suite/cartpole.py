@@ -1,0 +1,72 @@
+"""Cart-pole: keep the pole up (balance), or swing it up first (swingup). 10 ms a step."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from dm_control.suite import cartpole
+
+from envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, make_env
+from envs.suite.rewards import tolerance
+from purerl import model as lookup
+from purerl.types import Array
+
+TASKS = ("balance", "swingup")
+READINGS = ("xmat",)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Settings of the task."""
+
+    task: str = "swingup"  # "balance" or "swingup"
+
+
+@dataclass(frozen=True)
+class Cartpole:
+    """The domain; `build` makes an environment of it."""
+
+    task: str
+    slider: int  # in qpos
+    hinge: int  # in qpos, and in qvel
+    pole: int  # body
+
+    def start(self, key: Array) -> Start:
+        """Hanging, or standing, with a little noise."""
+        place_key, speed_key = jax.random.split(key)
+        if self.task == "swingup":
+            place = jnp.array([0.0, np.pi]) + 0.01 * jax.random.normal(place_key, (2,))
+        else:
+            limit = jnp.array([0.1, 0.034])
+            place = jax.random.uniform(place_key, (2,), minval=-limit, maxval=limit)
+        qpos = jnp.zeros(2).at[jnp.array([self.slider, self.hinge])].set(place)
+        return Start(qpos, 0.01 * jax.random.normal(speed_key, (2,)), {})
+
+    def observe(self, moment: Moment) -> Array:
+        """Position, cosine and sine of the angle, velocities: [5]."""
+        pole = moment.readings.xmat[self.pole]
+        position = jnp.stack([moment.physics.qpos[self.slider], pole[2, 2], pole[0, 2]])
+        return jnp.concatenate([position, moment.physics.qvel])
+
+    def reward(self, moment: Moment) -> dict[str, Array]:
+        """Upright, in the middle, with little force and slowly: the product."""
+        upright = (moment.readings.xmat[self.pole, 2, 2] + 1) / 2
+        centered = (1 + tolerance(moment.physics.qpos[self.slider], margin=2)) / 2
+        force = tolerance(moment.ctrl[0], margin=1, value_at_margin=0, sigmoid="quadratic")
+        slow = (1 + tolerance(moment.physics.qvel[self.hinge], margin=5)) / 2
+        reward = upright * (4 + force) / 5 * slow * centered
+        return {"reward": reward, "upright": upright, "centered": centered}
+
+
+def build(options: Options = Options(), engine: str = "auto") -> SuiteEnv:  # noqa: B008
+    """Builds the environment on an engine of `purerl.physics`."""
+    check_task(options.task, TASKS)
+    model = load_model(cartpole.Physics, cartpole.get_model_and_assets(), engine)
+    domain = Cartpole(
+        task=options.task,
+        slider=int(lookup.qpos_indices(model, ["slider"])[0]),
+        hinge=int(lookup.qpos_indices(model, ["hinge_1"])[0]),
+        pole=lookup.find(model, "body", "pole_1"),
+    )
+    return make_env(domain, model, READINGS, 0.01, engine)

@@ -1,0 +1,97 @@
+"""Humanoid: stand, walk at 1 m/s or run at 10 m/s, in any direction. 25 ms a step."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import jax.numpy as jnp
+import numpy as np
+from dm_control.suite import humanoid
+
+from envs.suite.base import (
+    Moment,
+    Start,
+    SuiteEnv,
+    check_task,
+    draw_apart,
+    load_model,
+    make_env,
+    random_joints,
+    touching_pairs,
+)
+from envs.suite.rewards import tolerance
+from purerl import model as lookup
+from purerl.physics import Physics
+from purerl.types import Array
+
+SPEEDS = {"stand": 0.0, "walk": 1.0, "run": 10.0}  # [m/s]
+STAND_HEIGHT = 1.4  # of the head [m]
+LIMBS = ("left_hand", "left_foot", "right_hand", "right_foot")
+CANDIDATES = 16  # starting poses to draw, to have one in which nothing touches
+READINGS = ("xpos", "xmat", "sensordata")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Settings of the task."""
+
+    task: str = "walk"  # "stand", "walk" or "run"
+
+
+@dataclass(frozen=True)
+class Humanoid:
+    """The domain; `build` makes an environment of it."""
+
+    target_speed: float  # [m/s]; 0 to stand
+    geoms: Physics  # to see what touches in a starting pose
+    torso: int  # body
+    head: int  # body
+    limbs: tuple[int, ...]  # bodies
+    velocity: slice  # of the centre of mass, in sensordata
+
+    def start(self, key: Array) -> Start:
+        """Any pose in which nothing touches, in the air, at rest."""
+        model = self.geoms.model
+        draw = partial(random_joints, model)
+        qpos = draw_apart(draw, self.geoms, touching_pairs(model), key, CANDIDATES)
+        return Start(qpos, jnp.zeros(model.nv), {})
+
+    def observe(self, moment: Moment) -> Array:
+        """Joints, head height, limbs and vertical as the torso sees them, velocities: [67]."""
+        xpos, torso = moment.readings.xpos, moment.readings.xmat[self.torso]
+        limbs = (xpos[jnp.array(self.limbs)] - xpos[self.torso]) @ torso
+        parts = (moment.physics.qpos[7:], xpos[self.head, 2:], limbs.ravel(), torso[2])
+        velocity = moment.readings.sensordata[self.velocity]
+        return jnp.concatenate([*parts, velocity, moment.physics.qvel])
+
+    def reward(self, moment: Moment) -> dict[str, Array]:
+        """Standing upright with little force, and still or at speed: the product."""
+        height = moment.readings.xpos[self.head, 2]
+        standing = tolerance(height, (STAND_HEIGHT, np.inf), STAND_HEIGHT / 4)
+        up = moment.readings.xmat[self.torso, 2, 2]
+        upright = tolerance(up, (0.9, np.inf), 1.9, value_at_margin=0, sigmoid="linear")
+        force = tolerance(moment.ctrl, margin=1, value_at_margin=0, sigmoid="quadratic")
+        velocity = moment.readings.sensordata[self.velocity][:2]
+        reward = standing * upright * (4 + force.mean()) / 5 * self._moving(velocity)
+        return {"reward": reward, "height": height, "speed": jnp.linalg.norm(velocity)}
+
+    def _moving(self, velocity: Array) -> Array:
+        if not self.target_speed:
+            return tolerance(velocity, margin=2).mean()
+        speed, target = jnp.linalg.norm(velocity), self.target_speed
+        fast = tolerance(speed, (target, np.inf), target, value_at_margin=0, sigmoid="linear")
+        return (5 * fast + 1) / 6
+
+
+def build(options: Options = Options(), engine: str = "auto") -> SuiteEnv:  # noqa: B008
+    """Builds the environment on an engine of `purerl.physics`."""
+    check_task(options.task, tuple(SPEEDS))
+    model = load_model(humanoid.Physics, humanoid.get_model_and_assets(), engine)
+    domain = Humanoid(
+        target_speed=SPEEDS[options.task],
+        geoms=Physics(model, ("geom_xpos", "geom_xmat"), 1, engine),
+        torso=lookup.find(model, "body", "torso"),
+        head=lookup.find(model, "body", "head"),
+        limbs=tuple(lookup.find(model, "body", name) for name in LIMBS),
+        velocity=lookup.sensor_slice(model, "torso_subtreelinvel"),
+    )
+    return make_env(domain, model, READINGS, 0.025, engine)
