@@ -299,7 +299,7 @@ def _flush(path: Path) -> None:
 
 def _orbax() -> Any:
     """Imports Orbax late (0.3 s), and without its running commentary."""
-    logging.getLogger("absl").setLevel(logging.ERROR)
+    logging.getLogger("absl").setLevel(logging.CRITICAL)  # errors are reported by us
     import orbax.checkpoint
 
     return orbax.checkpoint

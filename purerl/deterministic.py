@@ -207,7 +207,7 @@ def _fold(eqn: core.JaxprEqn, known: list[Known]) -> list[Known]:
 
 def _scan(params: dict, inputs: list, known: list[Known]) -> list:
     """`lax.scan` with a rewritten body."""
-    body, n, m = params["jaxpr"], params["num_consts"], params["num_carry"]
+    body, (n, m) = params["jaxpr"], _scan_sizes(params)
     known_body = known[:n] + [None] * (len(inputs) - n)
 
     def step(carry, x):
@@ -219,6 +219,14 @@ def _scan(params: dict, inputs: list, known: list[Known]) -> list:
         step, carry, xs, params["length"], reverse=params["reverse"], unroll=params["unroll"]
     )
     return [*carry, *ys]
+
+
+def _scan_sizes(params: dict) -> tuple[int, int]:
+    """How many of a scan's inputs are constants, and how many the carry."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    consts, carry, _ = params["ft_in"].unpack()  # since jax 0.11
+    return len(consts), len(carry)
 
 
 def _while(params: dict, inputs: list, known: list[Known]) -> list:

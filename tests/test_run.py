@@ -345,3 +345,15 @@ def test_the_plan_never_exceeds_the_budget():
     plan = train.make_plan(config, Evaluation(), 0, 0)
     assert plan.steps == 384 <= config.num_steps < 384 + plan.steps_per_update
     assert plan.checkpoints == (12,)
+
+
+def test_the_second_signal_ends_at_once(monkeypatch, capsys):
+    ended = []
+    monkeypatch.setattr(os, "_exit", ended.append)
+    with run.stop_signals() as stop:
+        assert not stop()
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop() and not ended
+        os.kill(os.getpid(), signal.SIGINT)
+    assert ended == [128 + signal.SIGINT]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -95,9 +95,25 @@ class SuiteEnv:
 def load_model(physics: type, xml: tuple[str, dict[str, bytes]], engine: str) -> mujoco.MjModel:
     """Compiles a domain's own MJCF, given its dm_control Physics class, XML and assets."""
     model = physics.from_xml_string(*xml).model.ptr
+    disable_energy(model)
+    mask_disabled_contacts(model)
     if choose_engine(engine) == "jax":
         few_iterations(model)
     return model
+
+
+def disable_energy(model: mujoco.MjModel) -> None:
+    """Stops the computation of the total energy: nothing reads it, and MJX does not have it."""
+    model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+
+
+def mask_disabled_contacts(model: mujoco.MjModel) -> None:
+    """Masks all geoms of a model whose contacts are disabled.
+
+    It changes nothing, but MJX refuses a pair of shapes that it could not collide, even there.
+    """
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+        model.geom_contype[:] = model.geom_conaffinity[:] = 0
 
 
 def few_iterations(model: mujoco.MjModel) -> None:
