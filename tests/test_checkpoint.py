@@ -74,11 +74,9 @@ def test_the_digest_sees_every_kind_of_change(change):
 
 
 def test_flatten_copies():
-    state = make_state(1.0)
-    leaves = checkpoint.flatten(state)
-    update = jax.jit(lambda x: jax.tree.map(lambda y: y + 1, x), donate_argnums=0)
-    update(state["params"])["w.x"].block_until_ready()
-    np.testing.assert_array_equal(leaves["params/w.x"], np.ones((30, 4), np.float32))
+    # On a CPU a jax.Array hands out a read-only view of its buffer, which donation may overwrite.
+    for path, array in checkpoint.flatten(make_state()).items():
+        assert array.flags.owndata and array.flags.writeable, path
 
 
 def test_a_flipped_bit_is_noticed_and_its_leaf_named(tmp_path, monkeypatch):
