@@ -17,8 +17,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "dm-control", "flax", "optax", "numpy")
-PACKAGES += ("orbax-checkpoint",)
+PACKAGES = ["jax", "jaxlib", "mujoco", "mujoco-mjx", "dm-control", "flax", "optax", "numpy"]
+PACKAGES += ["orbax-checkpoint"]
 INFORMATIVE = ("run_id", "git_revision", "git_dirty", "allowed_changes")
 FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE", "JAX_PLATFORMS", "JAX_ENABLE_X64")
 
@@ -33,21 +33,25 @@ def collect(engine: str, builders: Iterable[Callable]) -> dict[str, Any]:
     import jax
 
     device = jax.devices()[0]
-    found = {
+    about = {
+        "platform": device.platform,
+        "kind": _device_kind(device),
+        "count": jax.device_count(),
+    }
+    if device.platform == "cpu":  # XLA's pool size changes the bits of matrix products on a CPU
+        about["threads"] = cpu_threads()
+    options = jax.config.values
+    return {
         "versions": {"python": platform.python_version()} | {p: _version(p) for p in PACKAGES},
-        "device": {"platform": device.platform, "kind": _device_kind(device)},
+        "device": about,
         "engine": engine,
-        "matmul_precision": str(jax.config.jax_default_matmul_precision or "default"),
-        "x64": bool(jax.config.jax_enable_x64),
-        "prng": str(jax.config.jax_default_prng_impl),
-        "threefry_partitionable": bool(jax.config.jax_threefry_partitionable),
+        "matmul_precision": options["jax_default_matmul_precision"] or "default",
+        "x64": options["jax_enable_x64"],
+        "prng": options["jax_default_prng_impl"],
+        "threefry_partitionable": options["jax_threefry_partitionable"],
         "flags": {name: os.environ[name] for name in FLAGS if name in os.environ},
         "source": source_hash(builders),
     } | _git(Path(__file__).parent)
-    found["device"]["count"] = jax.device_count()
-    if device.platform == "cpu":  # XLA's pool size changes the bits of matrix products on a CPU
-        found["device"]["threads"] = cpu_threads()
-    return found
 
 
 def cpu_threads() -> int:

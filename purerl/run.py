@@ -291,7 +291,8 @@ def set_up_jax(cache: bool) -> str:
         jax.config.update("jax_enable_compilation_cache", False)
         return "off"
     # JAX has read JAX_COMPILATION_CACHE_DIR by now, if it is set.
-    folder = jax.config.jax_compilation_cache_dir or str(Path.home() / ".cache" / "purerl" / "jax")
+    folder = jax.config.values["jax_compilation_cache_dir"]
+    folder = folder or str(Path.home() / ".cache" / "purerl" / "jax")
     jax.config.update("jax_compilation_cache_dir", folder)
     return folder
 
