@@ -50,6 +50,8 @@ class Options:
     """Send metrics to Weights & Biases too (needs purerl[wandb])."""
     wandb_project: str = "purerl"
     """The W&B project."""
+    video: bool = False
+    """Make a video at each evaluation, in a process of low priority (see purerl.render)."""
     cache: bool = True
     """Keep compiled programs in JAX_COMPILATION_CACHE_DIR, or in ~/.cache/purerl/jax."""
 
@@ -173,6 +175,7 @@ def execute(
       stack: closes what is opened here.
     """
     from purerl import checkpoint, console, manifest, rundir, train
+    from purerl.run_video import RunVideo
 
     rundir.check_new_or_resume(folder, options.resume)
     loggers = needed_loggers(options)
@@ -200,6 +203,8 @@ def execute(
     state, recorder, meta = first_state(saved, programs, chosen, options, folder, progress.say)
     stack.callback(recorder.close)
     recorder.loggers = [start(folder, settings, meta["update"], progress.say) for start in loggers]
+    if options.video:
+        recorder.loggers.append(RunVideo(folder, stop, progress.say))
     meta["fingerprint"] = manifest.fingerprint(facts)
     train.train(plan, programs, state, recorder, progress, stop, progress.say, meta)
     progress.say(f"Done: {plan.steps:,} steps. Digest {recorder.digest}")
