@@ -108,8 +108,6 @@ def build_arena(arena: Arena) -> mjcf.RootElement:
     material = _checker(root, tile=0.5)
     half = [arena.longest_platform / 2, arena.width / 2, _THICKNESS]
     for i in range(arena.boxes):
-        # A body for each box: MuJoCo finds the contacts of one body's several geoms with
-        # bounding volumes made when the model is compiled, and these boxes move.
         # Compiled at the size of the longest: the bounding sphere stays, and has to hold them all.
         body = root.worldbody.add("body", name=f"{GROUND}_{i}")
         body.add("geom", name=f"{GROUND}_{i}", type="box", size=half, mass=0, material=material)

@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from mujoco.batch import Batch
 
 from envs import arenas
+from envs import compose as compose_module
 from envs.arenas import Floor, GapsCorridor, course_changes, draw_course
 from envs.bodies import ANT, RODENT
 from envs.compose import PREFIX, compose
@@ -97,23 +99,50 @@ def test_reach_holds_the_colliding_parts(case):
     assert 0.7 * body.reach < farthest < body.reach - 0.02
 
 
-def test_the_window_equals_all_platforms(case):
+def with_real_platforms(body, arena, course, monkeypatch):
+    """The reference: every platform of the course, compiled where it is and as long as it is."""
+
+    def build(_):
+        root = arenas.build_arena(dataclasses.replace(arena, boxes=len(course)))
+        for i, (start, end) in enumerate(np.float64(course)):
+            geom = root.find("geom", f"ground_{i}")
+            geom.pos = [(start + end) / 2, 0, -geom.size[2]]
+            geom.size = [(end - start) / 2, *geom.size[1:]]
+        return root
+
+    with monkeypatch.context() as patch:
+        patch.setattr(compose_module, "build_arena", build)
+        return compose(body, arena, engine="c").model
+
+
+def test_the_window_equals_all_platforms(case, monkeypatch):
     body, corridor = case
     arena = short(corridor)
-    every = dataclasses.replace(arena, boxes=ALL_BOXES)
-    assert every.platforms == ALL_BOXES
-    few, full = compose(body, arena, engine="c"), compose(body, every, engine="c")
+    assert arena.platforms == ALL_BOXES
+    few = compose(body, arena, engine="c")
     rng, touching = np.random.default_rng(1), 0
-    for i in range(60):
-        course = draw_course(jax.random.key(i % 4), arena)
-        x = rng.uniform(0.5, float(course[-2, 1]))
-        qpos = random_qpos(few, rng, x)
-        expected, contacts = forward(with_course(full, course, x), qpos)
-        got, found = forward(with_course(few, course, x), qpos)
-        assert found == contacts
-        np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-6)
-        touching += contacts > 0
-    assert touching > 20
+    for i in range(4):
+        course = draw_course(jax.random.key(i), arena)
+        full = with_real_platforms(body, arena, course, monkeypatch)
+        for x in rng.uniform(0.5, float(course[-2, 1]), 30):
+            qpos = random_qpos(few, rng, x)
+            expected, contacts = forward(full, qpos)
+            got, found = forward(with_course(few, course, x), qpos)
+            assert found == contacts
+            np.testing.assert_allclose(got, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max())
+            touching += contacts > 0
+    assert touching > 40
+
+
+def test_the_rodent_is_stable_under_random_actions():
+    """The masks and the time step were chosen for this; top speeds were 92 rad/s in 20 s of 256."""
+    model = compose(RODENT, Floor(), engine="c").model
+    batch, rng = Batch(model, 8), np.random.default_rng(0)
+    for _ in range(100):
+        batch.bind("ctrl")[:] = rng.uniform(-1, 1, (8, model.nu))
+        batch.step(nstep=5)
+        assert np.abs(batch.bind("qvel")).max() < 200
+    np.testing.assert_allclose(batch.bind("time"), 100 * 5 * model.opt.timestep)  # none was reset
 
 
 def test_a_box_is_where_its_platform_is(case):
