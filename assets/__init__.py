@@ -1,0 +1,1 @@
+"""MJCF that this project wrote itself."""

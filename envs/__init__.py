@@ -1,0 +1,1 @@
+"""The environments: bodies, arenas and tasks, one readable file each."""

@@ -10,7 +10,6 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from envs.arenas import (
     Floor,
@@ -34,7 +33,7 @@ BODY_READINGS = ("cinert", "cvel")
 
 @dataclasses.dataclass(frozen=True)
 class Randomization:
-    """Factors on the model's own values, drawn uniformly once an episode; (1, 1) changes nothing."""
+    """Factors on the model's own values, uniform once an episode; (1, 1) changes nothing."""
 
     friction: tuple[float, float] = (1.0, 1.0)
     """Sliding friction of every geom."""
@@ -242,9 +241,10 @@ def randomized_fields(
     for name, factor in factors.items():
         for field in fields[name]:
             own = jnp.asarray(getattr(model, field), jnp.float32)
-            # Of the three numbers of a friction only the first slides.
-            sliding = np.array([1.0, 0.0, 0.0], np.float32)
-            changes[field] = own * (1 + (factor - 1) * sliding) if name == "friction" else own * factor
+            if name == "friction":  # of its three numbers only the first slides
+                changes[field] = own.at[:, 0].multiply(factor)
+            else:
+                changes[field] = own * factor
     return changes
 
 

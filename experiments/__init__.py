@@ -1,0 +1,1 @@
+"""One file an experiment: what you copy to start your own."""

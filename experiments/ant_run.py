@@ -1,6 +1,6 @@
 """dm_control's ant runs forward on a floor.
 
-    python -m purerl.run ant_run
+python -m purerl.run ant_run
 """
 
 from envs import ant_run

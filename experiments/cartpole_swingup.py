@@ -1,6 +1,6 @@
 """Cart-pole swing-up: the smallest task worth learning, and the first thing to run.
 
-    python -m purerl.run cartpole_swingup
+python -m purerl.run cartpole_swingup
 """
 
 from envs import cartpole_swingup

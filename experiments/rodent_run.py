@@ -1,6 +1,6 @@
 """dm_control's rodent runs forward on a floor.
 
-    python -m purerl.run rodent_run
+python -m purerl.run rodent_run
 """
 
 from envs import run
@@ -12,7 +12,8 @@ experiment = Experiment(
     build_env=run.build,
     env=run.Options(body="rodent"),
     build_network=networks.mlp,
-    network=networks.MlpOptions(policy_hidden=(256, 256), value_hidden=(256, 256)),
+    # At a larger scale the control cost of 38 actuators outweighs being alive, and falling pays.
+    network=networks.MlpOptions(policy_hidden=(256, 256), value_hidden=(256, 256), initial_std=0.3),
     ppo=Config(
         num_steps=10_000_000,
         num_envs=128,

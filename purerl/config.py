@@ -54,6 +54,7 @@ class Config:
     """Fresh starts drawn for each environment in each update; one that ends more often replays."""
 
     def __post_init__(self) -> None:
+        """Raises ValueError for a number outside its range or a budget below one update."""
         for name in _POSITIVE_INTEGERS:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1.")

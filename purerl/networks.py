@@ -6,7 +6,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import flax.linen as nn
 import jax
@@ -83,6 +83,7 @@ class Stack(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
+        """Returns [..., last width]."""
         for width in self.widths:
             x = ACTIVATIONS[self.activation](nn.Dense(width)(x))
         return x
@@ -97,6 +98,7 @@ class GaussianHead(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array) -> Normal:
+        """Returns the Gaussian of features [..., H]."""
         # Nearly zero weights: the first policy explores alike everywhere.
         small = nn.initializers.variance_scaling(1e-4, "fan_in", "truncated_normal")
         loc = nn.Dense(self.action_size, kernel_init=small, name="loc")(x)
@@ -117,6 +119,7 @@ class MlpActorCritic(nn.Module):
 
     @nn.compact
     def __call__(self, observation: PyTree) -> PolicyOutput:
+        """Applies both towers to observations, leaves [..., O]."""
         o = self.options
         policy = Stack(o.policy_hidden, o.activation, name="policy")(policy_features(observation))
         normal = GaussianHead(self.action_size, o.std, o.initial_std, name="head")(policy)
@@ -132,6 +135,7 @@ class RecurrentActorCritic(nn.Module):
 
     @nn.compact
     def __call__(self, observation: PyTree, carry: PyTree) -> tuple[PolicyOutput, PyTree]:
+        """Moves the memory [..., H] on by one observation, and answers from it."""
         o = self.options
         encoded = Stack(o.encoder, o.activation, name="encoder")(policy_features(observation))
         cell = {"gru": nn.GRUCell, "lstm": nn.OptimizedLSTMCell}[o.cell](o.hidden, name="cell")
@@ -159,8 +163,9 @@ def from_linen(module: nn.Module, observation: PyTree, carry: PyTree = ()) -> Ne
 
     def apply(params: PyTree, observation: PyTree, carry: PyTree) -> tuple[PolicyOutput, PyTree]:
         if recurrent:
-            return module.apply(params, observation, carry)  # type: ignore[return-value]
-        return module.apply(params, observation), carry  # type: ignore[return-value]
+            return module.apply(params, observation, carry)
+        output: Any = module.apply(params, observation)
+        return output, carry
 
     return Network(init=init, apply=apply)
 

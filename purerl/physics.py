@@ -1,7 +1,8 @@
 """MuJoCo behind one small stateless interface, whatever the engine."""
 
+import collections
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,20 +15,30 @@ from purerl.types import Array
 
 ENGINES = ("auto", "c", "jax", "warp")
 
-_POSITION = ("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos")
+_POSITION: tuple[str, ...] = (
+    "xpos",
+    "xquat",
+    "xmat",
+    "xipos",
+    "ximat",
+    "xanchor",
+    "xaxis",
+    "geom_xpos",
+)
 _POSITION += ("geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat", "subtree_com")
 _POSITION += ("cinert", "crb", "cdof", "ten_length", "actuator_length")
-_VELOCITY = ("cvel", "cdof_dot", "ten_velocity", "actuator_velocity", "qfrc_bias")
+_VELOCITY: tuple[str, ...] = ("cvel", "cdof_dot", "ten_velocity", "actuator_velocity", "qfrc_bias")
 _VELOCITY += ("qfrc_passive", "subtree_linvel", "subtree_angmom")
-_ACCELERATION = ("qacc", "act_dot", "actuator_force", "qfrc_actuator", "qfrc_smooth")
+_ACCELERATION: tuple[str, ...] = ("qacc", "act_dot", "actuator_force", "qfrc_actuator")
+_ACCELERATION += ("qfrc_smooth",)
 _ACCELERATION += ("qacc_smooth", "qfrc_constraint", "cacc", "cfrc_int", "cfrc_ext")
 READINGS = (*_POSITION, *_VELOCITY, *_ACCELERATION, "sensordata")
 
 _S = mujoco.mjtSensor
 # Fields that MuJoCo computes only for the sake of a sensor: without one they hold old values.
-_FOR_BODY_FORCES = (_S.mjSENS_ACCELEROMETER, _S.mjSENS_FORCE, _S.mjSENS_TORQUE)
+_FOR_BODY_FORCES: tuple = (_S.mjSENS_ACCELEROMETER, _S.mjSENS_FORCE, _S.mjSENS_TORQUE)
 _FOR_BODY_FORCES += (_S.mjSENS_FRAMELINACC, _S.mjSENS_FRAMEANGACC)
-_FOR_SUBTREE = (_S.mjSENS_SUBTREELINVEL, _S.mjSENS_SUBTREEANGMOM)
+_FOR_SUBTREE: tuple = (_S.mjSENS_SUBTREELINVEL, _S.mjSENS_SUBTREEANGMOM)
 _NEEDS_SENSOR = dict.fromkeys(("cacc", "cfrc_int", "cfrc_ext"), _FOR_BODY_FORCES)
 _NEEDS_SENSOR |= dict.fromkeys(("subtree_linvel", "subtree_angmom"), _FOR_SUBTREE)
 
@@ -97,7 +108,7 @@ class Physics:
         self.model, self.substeps = model, substeps
         self.engine = choose_engine(engine)
         self.control_timestep = substeps * float(model.opt.timestep)
-        record = NamedTuple("Readings", [(name, Array) for name in readings])
+        record: Any = collections.namedtuple("Readings", readings)  # noqa: PYI024
         self._engine = _build_engine(self.engine, model, record, substeps)
 
     def init(
@@ -149,7 +160,7 @@ def choose_engine(engine: str) -> str:
     return engine
 
 
-def _build_engine(engine: str, model: mujoco.MjModel, record: type, substeps: int) -> Any:
+def _build_engine(engine: str, model: mujoco.MjModel, record: Any, substeps: int) -> Any:
     """Imports only the engine asked for: MJX alone takes seconds to import."""
     if engine == "c":
         from purerl.engine_c import CEngine

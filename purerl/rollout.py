@@ -186,7 +186,7 @@ def count_finished(finished: Finished, episode: EpisodeStats, over: Array, lost:
     """Adds the episodes that are `over` [B] soundly, and counts the `lost` [B]."""
     sound = over & ~lost
 
-    def add(total: Array, x: Array) -> Array:
+    def add(total: Array, x: Array | float) -> Array:
         return total + jnp.where(sound, x, 0.0)
 
     metrics = {

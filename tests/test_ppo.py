@@ -59,19 +59,23 @@ class Walk:
         )
 
 
+INIT = jax.jit(ppo.init, static_argnums=(0, 1, 2))
+UPDATE = jax.jit(ppo.update, static_argnums=(0, 1, 2))
+ROLLOUT = jax.jit(rollout, static_argnums=(0, 1, 2))
+NETWORKS = {
+    False: networks.mlp(MLP, jnp.zeros(2), 1),
+    True: networks.recurrent(GRU, jnp.zeros(2), 1),
+}
+
+
 def setup(config=CONFIG, env=None, recurrent=False, seed=0):
     """An initial state whose statistics are not trivial, and everything that made it."""
     env = Walk() if env is None else env
-    build, options = (networks.recurrent, GRU) if recurrent else (networks.mlp, MLP)
-    network = build(options, jnp.zeros(2), 1)
-    state = jax.jit(partial(ppo.init, config, env, network))(jax.random.key(seed))
+    network = NETWORKS[recurrent]
+    state = INIT(config, env, network, jax.random.key(seed))
     samples = jax.random.normal(jax.random.key(9), (50, 2)) * 2.0 + 0.3
     statistics = normalizer.update(state.normalizer, samples, jnp.ones(50, bool))
     return env, network, state.replace(normalizer=statistics)
-
-
-def act_for_a_rollout(config, env, network, state):
-    return jax.jit(partial(rollout, config, env, network))(state)
 
 
 @pytest.mark.parametrize("recurrent", [False, True])
@@ -79,20 +83,18 @@ def test_the_first_ratio_is_one(recurrent):
     """Before any gradient step, the learner computes the very log-probability that acted."""
     config = dataclasses.replace(CONFIG, num_epochs=1, num_minibatches=1, num_envs=6)
     env, network, state = setup(config, recurrent=recurrent)
-    _, metrics = jax.jit(partial(ppo.update, config, env, network))(state)
+    _, metrics = UPDATE(config, env, network, state)
     assert abs(metrics["kl"]) < 1e-10
     assert metrics["clip_fraction"] == 0.0
 
 
 def test_statistics_are_frozen_until_the_end_of_the_update():
     env, network, state = setup()
-    after, transitions, _, _ = act_for_a_rollout(CONFIG, env, network, state)
+    after, transitions, _, _ = ROLLOUT(CONFIG, env, network, state)
     assert count_as_int(after.normalizer.count) == 50
-    updated, _ = jax.jit(partial(ppo.update, CONFIG, env, network))(state)
+    updated, _ = UPDATE(CONFIG, env, network, state)
     assert count_as_int(updated.normalizer.count) == 50 + 6 * 16
-    expected = normalizer.update(
-        state.normalizer, transitions.observation, jnp.ones((16, 6), bool)
-    )
+    expected = normalizer.update(state.normalizer, transitions.observation, jnp.ones((16, 6), bool))
     np.testing.assert_allclose(
         updated.normalizer.mean.value, expected.mean.value, rtol=1e-5, atol=1e-6
     )
@@ -102,7 +104,7 @@ def test_time_limits_truncate_and_the_first_are_staggered():
     env, network, state = setup()
     limits = np.asarray(state.episode.limit)
     assert len(set(limits.tolist())) > 2 and limits.max() <= LENGTH and limits.min() >= 1
-    _, transitions, finished, _ = act_for_a_rollout(CONFIG, env, network, state)
+    _, transitions, finished, _ = ROLLOUT(CONFIG, env, network, state)
     done = np.asarray(transitions.done)
     for b in range(6):
         ends = np.flatnonzero(done[:, b]) + 1
@@ -117,9 +119,9 @@ def test_every_start_is_fresh():
     """No two episodes of an update begin alike, nor do those of the next update."""
     env, network, state = setup()
     starts = []
-    update = jax.jit(partial(ppo.update, CONFIG, env, network))
+    update = partial(UPDATE, CONFIG, env, network)
     for _ in range(2):
-        _, transitions, _, _ = act_for_a_rollout(CONFIG, env, network, state)
+        _, transitions, _, _ = ROLLOUT(CONFIG, env, network, state)
         first = np.concatenate([np.zeros((1, 6), bool), np.asarray(transitions.done)[:-1]])
         starts += np.asarray(transitions.observation)[first][:, 0].tolist()
         state, metrics = update(state)
@@ -130,8 +132,8 @@ def test_every_start_is_fresh():
 def test_replayed_starts_are_counted():
     config = dataclasses.replace(CONFIG, resets_per_update=1)
     env, network, state = setup(config)
-    _, transitions, finished, _ = act_for_a_rollout(config, env, network, state)
-    _, metrics = jax.jit(partial(ppo.update, config, env, network))(state)
+    _, transitions, finished, _ = ROLLOUT(config, env, network, state)
+    _, metrics = UPDATE(config, env, network, state)
     ends = np.asarray(transitions.done).sum(0)
     assert metrics["replayed_resets"] == np.maximum(ends - 1, 0).sum() > 0
 
@@ -155,7 +157,7 @@ def slow_batch(transitions, last_value, observations_before_reset, value_of, gam
 
 def test_truncation_bootstraps_from_the_observation_before_the_reset():
     env, network, state = setup(env=Walk(edge=1.5))
-    after, transitions, _, last_value = act_for_a_rollout(CONFIG, env, network, state)
+    after, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
     batch = ppo.make_batch(CONFIG, state, transitions, last_value, state.episode.length == 0)
     transitions = jax.tree.map(np.asarray, transitions)
     assert transitions.terminated.any() and transitions.truncated.any()
@@ -179,11 +181,11 @@ def test_truncation_bootstraps_from_the_observation_before_the_reset():
 def test_recurrent_memory_restarts_with_each_episode_in_rollout_and_learner():
     """The learner's unroll, from the stored memory, gives the rollout's values bit for bit."""
     env, network, state = setup(recurrent=True)
-    update = jax.jit(partial(ppo.update, CONFIG, env, network))
+    update = partial(UPDATE, CONFIG, env, network)
     for _ in range(2):  # so that memories are not zero when the rollout begins
         state, _ = update(state)
     assert jnp.abs(state.carry).max() > 0
-    _, transitions, _, last_value = act_for_a_rollout(CONFIG, env, network, state)
+    _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
     first = state.episode.length == 0
     batch = ppo.make_batch(CONFIG, state, transitions, last_value, first)
     output = ppo.unroll(network, state.params, batch, state.carry)
@@ -200,7 +202,7 @@ def test_action_repeat_stops_at_the_end_of_an_episode():
     config = dataclasses.replace(CONFIG, action_repeat=3, rollout_length=8)
     env, network, state = setup(config)
     state = state.replace(episode=state.episode.replace(limit=jnp.full(6, LENGTH, jnp.int32)))
-    _, transitions, finished, _ = act_for_a_rollout(config, env, network, state)
+    _, transitions, finished, _ = ROLLOUT(config, env, network, state)
     action = np.tanh(np.asarray(transitions.raw_action)[..., 0])
     held = np.tile(np.array([3, 3, 1])[:, None], (3, 6))[:8]
     np.testing.assert_allclose(transitions.reward, action * held, rtol=1e-5, atol=1e-6)
@@ -216,8 +218,8 @@ def test_a_blown_up_environment_is_contained():
     x = state.env.physics["x"].at[3].set(40.0)
     state = state.replace(env=state.env.replace(physics={"x": x}))
     broken_env = Walk(cliff=39.5)
-    after, sound, _, _ = act_for_a_rollout(CONFIG, sound_env, network, state)
-    contained, lost, finished, _ = act_for_a_rollout(CONFIG, broken_env, network, state)
+    after, sound, _, _ = ROLLOUT(CONFIG, sound_env, network, state)
+    contained, lost, finished, _ = ROLLOUT(CONFIG, broken_env, network, state)
     assert (~np.asarray(lost.valid)).sum(0).tolist()[3] >= 1
     assert finished.nonfinite_resets.sum() == (~lost.valid).sum() == finished.nonfinite_resets[3]
     for a, b in zip(jax.tree.leaves(sound), jax.tree.leaves(lost), strict=True):
@@ -225,7 +227,7 @@ def test_a_blown_up_environment_is_contained():
         np.testing.assert_array_equal(np.asarray(a)[:, others], np.asarray(b)[:, others])
     for leaf in jax.tree.leaves((lost, contained.env, contained.episode)):
         assert np.isfinite(np.asarray(leaf, np.float64)).all()
-    updated, metrics = jax.jit(partial(ppo.update, CONFIG, broken_env, network))(state)
+    updated, metrics = UPDATE(CONFIG, broken_env, network, state)
     assert metrics["nonfinite_resets"] >= 1 and metrics["skipped_minibatches"] == 0
     valid = int(lost.valid.sum())
     assert count_as_int(updated.normalizer.count) == 50 + valid < 50 + 6 * 16
@@ -236,7 +238,7 @@ def test_a_blown_up_environment_is_contained():
 def test_a_lost_sample_has_no_weight_in_the_update():
     """Whatever stands in the lost rows, the gradient is the same."""
     env, network, state = setup()
-    _, transitions, _, last_value = act_for_a_rollout(CONFIG, env, network, state)
+    _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
     valid = transitions.valid.at[5, 2].set(False)
     done = transitions.done.at[5, 2].set(True)
     lost = transitions._replace(valid=valid, done=done)
@@ -253,7 +255,7 @@ def test_a_lost_sample_has_no_weight_in_the_update():
 
 def test_a_non_finite_minibatch_is_skipped_and_counted():
     env, network, state = setup()
-    _, transitions, _, last_value = act_for_a_rollout(CONFIG, env, network, state)
+    _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
     broken = transitions._replace(reward=transitions.reward.at[:].set(jnp.nan))
     batch = ppo.make_batch(CONFIG, state, broken, last_value, state.episode.length == 0)
     after, metrics = ppo.learn(CONFIG, network, state, batch, ())
@@ -268,9 +270,10 @@ def test_a_non_finite_minibatch_is_skipped_and_counted():
 
 def test_linear_schedule_and_exact_budget():
     config = dataclasses.replace(CONFIG, schedule="linear", num_steps=6 * 16 * 4 + 95)
-    assert config.num_updates == 4 and config.num_updates * config.steps_per_update <= config.num_steps
+    assert config.num_updates == 4
+    assert config.num_updates * config.steps_per_update <= config.num_steps
     env, network, state = setup(config)
-    update = jax.jit(partial(ppo.update, config, env, network))
+    update = partial(UPDATE, config, env, network)
     rates = []
     for _ in range(config.num_updates):
         state, metrics = update(state)
@@ -292,8 +295,8 @@ def test_reward_scaling_by_the_running_return():
     config = dataclasses.replace(CONFIG, reward_scaling="return_std")
     env, network, state = setup(config)
     assert ppo.reward_factor(config, state) == 1.0
-    _, transitions, _, _ = act_for_a_rollout(config, env, network, state)
-    state, _ = jax.jit(partial(ppo.update, config, env, network))(state)
+    _, transitions, _, _ = ROLLOUT(config, env, network, state)
+    state, _ = UPDATE(config, env, network, state)
     # By hand: G_t = gamma G_{t-1} + r_t, from 0 after each end.
     reward, done = np.asarray(transitions.reward), np.asarray(transitions.done)
     running, returns = np.zeros(6), []
@@ -308,7 +311,7 @@ def test_the_same_seed_learns_the_same_bits_and_another_does_not():
     states = []
     for seed in (0, 0, 1):
         env, network, state = setup(seed=seed)
-        update = jax.jit(partial(ppo.update, CONFIG, env, network))
+        update = partial(UPDATE, CONFIG, env, network)
         for _ in range(3):
             state, _ = update(state)
         states.append(np.concatenate([np.ravel(x) for x in jax.tree.leaves(state.params)]))
@@ -320,7 +323,7 @@ def test_update_keeps_rank_promotion_strict():
     """`[B, 1] - [B]` would silently become `[B, B]`; the whole update is traced without it."""
     env, network, state = setup(recurrent=True)
     with jax.numpy_rank_promotion("raise"):
-        jax.jit(partial(ppo.update, CONFIG, env, network)).trace(state)
+        UPDATE.trace(CONFIG, env, network, state)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from purerl import distributions, gae, losses, networks, normalizer, ppo
+from purerl import gae, losses, networks, normalizer, ppo
 from purerl.rollout import act
 from tests.probes import Probe
 
