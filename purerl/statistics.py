@@ -1,0 +1,143 @@
+"""Statistics over seeds, for few seeds: interquartile mean, bootstrap intervals, improvement.
+
+After Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice"
+(arXiv:2108.13264). A stratum holds the runs of one configuration on one task, which are drawn from
+independently of the others. Letters: n runs of a stratum, P points of a curve, R resamples.
+
+Percentile bootstrap intervals of a few runs are too narrow: of 3000 draws of normal values, the
+nominal 95% interval of the interquartile mean held the truth for 90% of those of 5 values and 94%
+of those of 10. So there is none below `LEAST_RUNS` runs.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+LEAST_RUNS = 5  # below, no interval is given
+RESAMPLES = 5000
+LEVEL = 0.95
+Values = np.ndarray
+Statistic = Callable[[Values], Values]  # [..., n] -> [...]
+
+
+class Interval(NamedTuple):
+    """A confidence interval at level `LEVEL`."""
+
+    low: float
+    high: float
+
+
+def interquartile_mean(values: Values) -> Values:
+    """Returns the mean of the middle half: [..., n] -> [...].
+
+    IQM(x) = mean of x_(k+1) .. x_(n-k), the sorted values without the lowest and the highest
+    k = floor(n / 4); the 25% trimmed mean. Less moved by an outlier than the mean, and more sure
+    for few runs than the median.
+    """
+    n = values.shape[-1]
+    if n == 0:
+        raise ValueError("The interquartile mean of no values is not defined.")
+    cut = n // 4
+    return np.sort(values, axis=-1)[..., cut : n - cut].mean(axis=-1)
+
+
+def pooled_iqm(strata: Sequence[Values]) -> Values:
+    """Returns the interquartile mean of all strata's values together: each [..., n_k] -> [...]."""
+    return interquartile_mean(np.concatenate(strata, axis=-1))
+
+
+def probability_of_improvement(x: Values, y: Values) -> Values:
+    """Returns how often a run of x is better than one of y: [..., n], [..., m] -> [...].
+
+    P(X > Y) + P(X = Y) / 2 over all n m pairs, that is, the Mann-Whitney U statistic over n m.
+    """
+    pairs = x[..., :, None] - y[..., None, :]
+    return (np.sign(pairs) / 2 + 0.5).mean(axis=(-2, -1))
+
+
+def stratified_probability(xs: Sequence[Values], ys: Sequence[Values]) -> Values:
+    """Averages `probability_of_improvement` over strata that correspond."""
+    pairs = zip(xs, ys, strict=True)
+    return np.mean([probability_of_improvement(x, y) for x, y in pairs], axis=0)
+
+
+def resample(strata: Sequence[Values], seed: int, number: int = RESAMPLES) -> list[Values]:
+    """Draws whole runs with replacement, within each stratum.
+
+    Args:
+      strata: each [n_k].
+      seed: of the draws; equal seeds give equal intervals.
+      number: R.
+
+    Returns:
+      For each stratum [R, n_k].
+    """
+    generator = np.random.default_rng(seed)
+    indices = [generator.integers(0, len(s), (number, len(s))) for s in strata]
+    return [s[i] for s, i in zip(strata, indices, strict=True)]
+
+
+def percentile_interval(replicates: Values) -> Interval:
+    """Returns the middle `LEVEL` of bootstrap replicates [R]."""
+    tail = 50.0 * (1.0 - LEVEL)
+    low, high = np.percentile(replicates, [tail, 100.0 - tail])
+    return Interval(float(low), float(high))
+
+
+def enough(*groups: Sequence[Values]) -> bool:
+    """Tells whether every stratum of every group has runs enough for an interval."""
+    return all(len(stratum) >= LEAST_RUNS for strata in groups for stratum in strata)
+
+
+def iqm_interval(strata: Sequence[Values], seed: int = 0) -> Interval | None:
+    """Returns the stratified bootstrap interval of the IQM; None for too few runs."""
+    if not enough(strata):
+        return None
+    return percentile_interval(pooled_iqm(resample(strata, seed)))
+
+
+def difference_interval(
+    xs: Sequence[Values], ys: Sequence[Values], seed: int = 0
+) -> Interval | None:
+    """Returns the interval of IQM(x) - IQM(y), both resampled; None for too few runs."""
+    if not enough(xs, ys):
+        return None
+    return percentile_interval(pooled_iqm(resample(xs, seed)) - pooled_iqm(resample(ys, seed + 1)))
+
+
+def improvement_interval(
+    xs: Sequence[Values], ys: Sequence[Values], seed: int = 0
+) -> Interval | None:
+    """Returns the interval of the probability of improvement; None for too few runs."""
+    if not enough(xs, ys):
+        return None
+    return percentile_interval(stratified_probability(resample(xs, seed), resample(ys, seed + 1)))
+
+
+class Band(NamedTuple):
+    """A learning curve over runs, [P] each; low and high are None for too few runs."""
+
+    iqm: Values
+    low: Values | None
+    high: Values | None
+
+
+def curve_band(strata: Sequence[Values], seed: int = 0, number: int = 2000) -> Band:
+    """Returns IQM and pointwise interval of curves.
+
+    Args:
+      strata: each [n_k, P], one row a run.
+      seed: of the draws; runs are drawn whole, so that every point is of the same resamples.
+      number: R.
+    """
+    iqm = pooled_iqm([s.T for s in strata])
+    if not enough(strata):
+        return Band(iqm, None, None)
+    rows = resample([np.arange(len(s)) for s in strata], seed, number)
+    points = range(strata[0].shape[1])
+    drawn = [
+        percentile_interval(pooled_iqm([s[i, p] for s, i in zip(strata, rows, strict=True)]))
+        for p in points
+    ]
+    return Band(iqm, np.array([b.low for b in drawn]), np.array([b.high for b in drawn]))
