@@ -120,6 +120,7 @@ class Renderer:
         """Gives the OpenGL context back."""
         self.context.free()
         self.gl.free()
+        self.gl = None  # its destructor, run when Python ends, would complain
 
     def start_episode(self) -> None:
         """Lets the following camera take its height and distance anew."""
@@ -204,21 +205,22 @@ class Renderer:
 def default_camera(model: Any) -> int | None:
     """Returns the id of the camera that shows the body best; None: follow it from the side.
 
-    A camera that tracks a body, best one named "side" or "track"; else, where nothing can leave
-    (no free joint), the model's first camera that stands in the world.
+    Where something can travel (a free or slide joint), a camera that tracks a body, best one named
+    "side" or "track". Else, but for free bodies, the first camera that stands in the world.
     """
     import mujoco
 
     from purerl.model import names
 
-    kinds = mujoco.mjtCamLight
-    modes = (int(kinds.mjCAMLIGHT_TRACK), int(kinds.mjCAMLIGHT_TRACKCOM))
-    tracking = [i for i in range(model.ncam) if model.cam_mode[i] in modes]
+    modes, joints = mujoco.mjtCamLight, set(model.jnt_type.tolist())
+    tracks = (int(modes.mjCAMLIGHT_TRACK), int(modes.mjCAMLIGHT_TRACKCOM))
+    tracking = [i for i in range(model.ncam) if model.cam_mode[i] in tracks]
     called = names(model, "camera")
     named = [i for i in tracking if "side" in called[i] or "track" in called[i]]
-    if named or tracking:
+    free, slide = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+    if tracking and joints & {free, slide}:
         return (named or tracking)[0]
-    if int(mujoco.mjtJoint.mjJNT_FREE) in model.jnt_type:
+    if free in joints:
         return None
     standing = [i for i in range(model.ncam) if model.cam_bodyid[i] == 0]
     return standing[0] if standing else None

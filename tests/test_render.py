@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -239,6 +240,7 @@ def test_the_camera_follows_a_free_body_along_the_ground():
         ("<joint type='slide'/>", "", None),
         ("<freejoint/><camera name='eye'/>" + TRACK.format("back"), "<camera name='s'/>", "back"),
         ("<freejoint/>" + TRACK.format("back") + TRACK.format("side"), "", "side"),
+        ("<joint type='hinge'/>" + TRACK.format("hand"), "<camera name='still'/>", "still"),
     ],
 )
 def test_the_default_camera_is_the_one_that_follows(joint, cameras, expected):
@@ -286,18 +288,12 @@ def test_no_run_and_no_physics_are_one_line(tmp_path, capsys):
 
 def test_settings_of_another_version_are_named(trained, tmp_path, capsys):
     copy = tmp_path / "run"
-    render_copy(trained, copy)
+    shutil.copytree(trained, copy)
     settings = json.loads((copy / "config.json").read_text())
     settings["settings"]["env"]["gravity"] = 9.81
     (copy / "config.json").write_text(json.dumps(settings))
     assert render.main([str(copy)]) == USAGE
     assert "env.gravity" in only_line(capsys)
-
-
-def render_copy(source: Path, target: Path) -> None:
-    import shutil
-
-    shutil.copytree(source, target)
 
 
 def test_without_opengl_one_line_says_what_to_install(trained, monkeypatch, capsys):
