@@ -16,13 +16,18 @@ EFFECTS = {
     "errors",
     "evaluate",
     "experiment",
+    "groups",
+    "history",
     "loggers",
     "manifest",
     "recorder",
     "render",
     "run",
+    "run_video",
     "rundir",
+    "scene",
     "train",
+    "twins",
     "video",
 }
 PURE = sorted(set(FILES) - EFFECTS - {"__init__"})
