@@ -12,14 +12,16 @@ import jax
 import jax.numpy as jnp
 
 from envs.arenas import (
+    Arena,
     Floor,
     GapsCorridor,
+    boxes_in_reach,
     course_changes,
     distances_to_next_edges,
     draw_course,
     gaps_crossed,
 )
-from envs.bodies import ANT, RODENT
+from envs.bodies import ANT, RODENT, Body
 from envs.compose import Composed, compose
 from purerl import model as lookup
 from purerl.env import State
@@ -62,6 +64,8 @@ class Options:
     """Gaps only: least and greatest length of a platform [m]."""
     gap_length: tuple[float, float] = (0.05, 0.2)
     """Gaps only: least and greatest length of a gap [m]."""
+    corridor_width: float = 4.0
+    """Gaps only: beyond half of it on either side, the body falls [m]."""
     reward: Literal["speed", "target"] = "speed"
     """The weighted terms below, or dm_control's corridor reward: speed / target_speed in [0, 1]."""
     target_speed: float = 1.0
@@ -144,8 +148,7 @@ class Run:
         torso, center = self.parts.torso, readings.subtree_com[self.parts.torso, 0]
         speed = (center - before) / self.control_timestep
         height, up = readings.xpos[torso, 2], readings.xmat[torso, 2, 2]
-        low, high = self.parts.body.healthy_height
-        healthy = (height > low) & (height < high) & (up > self.options.healthy_up)
+        healthy = is_healthy(self.parts.body, self.options, height, up)
         terms = reward_terms(self.options, speed, center - before, healthy, action)
         metrics = {"forward_velocity": speed, "height": height, "up": up}
         metrics |= {f"reward_{name}": term for name, term in terms.items()}
@@ -192,6 +195,15 @@ class Run:
             edges = distances_to_next_edges(task["course"], physics.qpos[0], 6, sight)
             parts += [physics.qpos[1:2], edges]
         return jnp.concatenate(parts)
+
+
+def is_healthy(body: Body, options: Options, height: Array, up: Array) -> Array:
+    """Tells whether the body can go on, [] bool: neither fallen, nor thrown up, nor on its back.
+
+    `height` [] of the torso [m], `up` [] the z of its up-axis.
+    """
+    low, high = body.healthy_height
+    return (height > low) & (height < high) & (up > options.healthy_up)
 
 
 def reward_terms(
@@ -248,11 +260,20 @@ def randomized_fields(
     return changes
 
 
+def build_arena(options: Options, body: Body) -> Arena:
+    """Returns the arena, its window of boxes as small as the body's reach allows."""
+    if options.arena == "floor":
+        return Floor()
+    corridor = GapsCorridor(
+        options.platform_length, options.gap_length, width=options.corridor_width
+    )
+    return dataclasses.replace(corridor, boxes=boxes_in_reach(corridor, body.reach))
+
+
 def build(options: Options = Options(), engine: str = "auto") -> Run:  # noqa: B008
     """Builds the environment on an engine of `purerl.physics`."""
     body = BODIES[options.body]
-    corridor = GapsCorridor(options.platform_length, options.gap_length)
-    parts = compose(body, corridor if options.arena == "gaps" else Floor(), engine)
+    parts = compose(body, build_arena(options, body), engine)
     model = parts.model
     joints = [lookup.names(model, "joint")[i] for i in parts.joints]
     readings = READINGS + (BODY_READINGS if options.observe_bodies else ())

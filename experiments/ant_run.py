@@ -3,14 +3,14 @@
 python -m purerl.run ant_run
 """
 
-from envs import ant_run
+from envs import run
 from purerl import networks
 from purerl.config import Config
 from purerl.experiment import Evaluation, Experiment
 
 experiment = Experiment(
-    build_env=ant_run.build,
-    env=ant_run.Options(),
+    build_env=run.build,
+    env=run.Options(body="ant"),
     build_network=networks.mlp,
     network=networks.MlpOptions(policy_hidden=(128, 128), value_hidden=(256, 256)),
     ppo=Config(
@@ -22,7 +22,7 @@ experiment = Experiment(
         learning_rate=3e-4,
         schedule="adaptive_kl",
         gamma=0.98,
-        reward_scale=0.1,
+        reward_scale=0.05,
     ),
     evaluation=Evaluation(num_episodes=32, number=10),
 )

@@ -1,0 +1,28 @@
+"""dm_control's ant runs along a corridor whose gaps differ in every episode.
+
+python -m purerl.run ant_gaps
+"""
+
+from envs import run
+from purerl import networks
+from purerl.config import Config
+from purerl.experiment import Evaluation, Experiment
+
+experiment = Experiment(
+    build_env=run.build,
+    env=run.Options(body="ant", arena="gaps"),
+    build_network=networks.mlp,
+    network=networks.MlpOptions(policy_hidden=(128, 128), value_hidden=(256, 256)),
+    ppo=Config(
+        num_steps=6_000_000,
+        num_envs=256,
+        rollout_length=32,
+        num_epochs=4,
+        num_minibatches=8,
+        learning_rate=3e-4,
+        schedule="adaptive_kl",
+        gamma=0.98,
+        reward_scale=0.05,
+    ),
+    evaluation=Evaluation(num_episodes=128, number=6),
+)

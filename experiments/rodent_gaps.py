@@ -1,0 +1,36 @@
+"""dm_control's rodent runs along a corridor whose gaps differ in every episode.
+
+python -m purerl.run rodent_gaps
+"""
+
+from envs import run
+from purerl import networks
+from purerl.config import Config
+from purerl.experiment import Evaluation, Experiment
+
+experiment = Experiment(
+    build_env=run.build,
+    env=run.Options(
+        body="rodent",
+        arena="gaps",
+        platform_length=(0.4, 0.8),
+        gap_length=(0.05, 0.2),
+        corridor_width=2.0,
+    ),
+    build_network=networks.mlp,
+    # At a larger scale the control cost of 38 actuators outweighs being alive, and falling pays.
+    network=networks.MlpOptions(policy_hidden=(256, 256), value_hidden=(256, 256), initial_std=0.3),
+    ppo=Config(
+        num_steps=10_000_000,
+        num_envs=128,
+        rollout_length=64,
+        num_epochs=4,
+        num_minibatches=8,
+        episode_length=500,  # 10 s
+        learning_rate=3e-4,
+        schedule="adaptive_kl",
+        gamma=0.98,
+        reward_scale=0.1,
+    ),
+    evaluation=Evaluation(num_episodes=32, number=10),
+)
