@@ -5,6 +5,7 @@ geometry that each episode really had; RUN/videos/<update>.png shows 16 moments 
 No screen is needed.
 """
 
+import contextlib
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -66,9 +67,10 @@ def render_run(options: Options) -> Path:
     for name, least in (("episodes", 1), ("seconds", 0.1)):
         if not getattr(options, name) >= least:
             raise UserError(f"{name} is {getattr(options, name)}; it must be at least {least}.")
-    from purerl.scene import Renderer, choose_gl
+    from purerl.scene import Renderer, open_gl
 
-    choose_gl()  # first of all: importing an experiment imports mujoco
+    # First of all: an experiment imports mujoco and dm_control, which look for OpenGL themselves.
+    open_gl(width, height).free()
 
     from purerl.rundir import restore
     from purerl.video import episode_pictures, frame_stride, physics_of
@@ -158,7 +160,8 @@ def write_files(
         raise RunError(f"{path} cannot be written: {one_line(error)}") from error
     finally:
         for kind in (".mp4", ".png"):
-            draft.with_suffix(kind).unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                draft.with_suffix(kind).unlink(missing_ok=True)
 
 
 def write_video(path: Path, frames: Iterator[Any], width: int, height: int, fps: float) -> None:

@@ -14,7 +14,7 @@ INSTALL = (
     "NVIDIA GPU, the EGL part of its driver (libnvidia-gl; in a container: "
     "NVIDIA_DRIVER_CAPABILITIES=all)."
 )
-BACKENDS = ("egl", "glfw", "osmesa")
+BACKENDS = ("egl", "osmesa")  # glfw draws only where there is a screen
 
 
 # --- OpenGL without a screen ---
@@ -40,12 +40,10 @@ def choose_gl(find: Callable[[str], str | None] = ctypes.util.find_library) -> s
             raise RunError(f"There is no OpenGL to draw with. {INSTALL}")
     if chosen not in BACKENDS:
         raise RunError(
-            f"MUJOCO_GL is {chosen!r}, with which nothing can be drawn; unset it, or set one of "
-            f"{', '.join(BACKENDS)}."
+            f"MUJOCO_GL is {chosen!r}, with which nothing can be drawn without a screen; unset it, "
+            f"or set one of {', '.join(BACKENDS)}."
         )
-    os.environ["MUJOCO_GL"] = chosen
-    if chosen != "glfw":
-        os.environ["PYOPENGL_PLATFORM"] = chosen
+    os.environ["MUJOCO_GL"] = os.environ["PYOPENGL_PLATFORM"] = chosen
     return chosen
 
 

@@ -319,6 +319,18 @@ def test_a_backend_that_does_not_start_says_what_to_install(monkeypatch):
         scene.open_gl(64, 48)
 
 
+def test_files_that_cannot_be_written_are_one_line(trained, tmp_path, capsys):
+    copy = tmp_path / "run"
+    shutil.copytree(trained, copy, ignore=shutil.ignore_patterns("videos"))
+    (copy / "videos").touch()
+    words = ["--size", "64x48", "--seconds", "0.1"]
+    assert render.main([str(copy), *words]) == FAILURE
+    assert "cannot be written" in only_line(capsys)
+    (copy / "videos").unlink()
+    assert render.main([str(copy), *words]) == 0
+    assert len(list((copy / "videos").iterdir())) == 2  # no draft is left
+
+
 # --- while training ---
 
 
