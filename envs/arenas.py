@@ -211,6 +211,14 @@ def course_changes(fields: BoxFields, course: Array, x: Array, reach: float) -> 
     }
 
 
+def platform_boxes(course: Array, width: float) -> tuple[Array, Array]:
+    """Returns a course [P, 2] as boxes: centers [P, 3] and half sizes [P, 3] [m]."""
+    half = (course[:, 1] - course[:, 0]) / 2
+    zero = jnp.zeros_like(half)
+    centers = jnp.stack([course.mean(axis=1), zero, zero - _THICKNESS], axis=1)
+    return centers, jnp.stack([half, zero + width / 2, zero + _THICKNESS], axis=1)
+
+
 def distances_to_next_edges(course: Array, x: Array, number: int, sight: float) -> Array:
     """What lies ahead: signed distances from x to the next edges of platforms.
 

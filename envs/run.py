@@ -20,6 +20,7 @@ from envs.arenas import (
     distances_to_next_edges,
     draw_course,
     gaps_crossed,
+    platform_boxes,
 )
 from envs.bodies import ANT, RODENT, Body
 from envs.compose import Composed, compose
@@ -134,6 +135,15 @@ class Run:
         """Returns this episode's model fields where the body is now (a video needs them too)."""
         return self._changes(state.task, state.physics.qpos[0])
 
+    def scenery(self, state: State) -> tuple[Array, Array]:
+        """Returns the whole course as boxes for a video: centers [P, 3], half sizes [P, 3] [m].
+
+        Physics knows only the few platforms within the body's reach.
+        """
+        if "course" not in state.task:
+            return jnp.zeros((0, 3)), jnp.zeros((0, 3))
+        return platform_boxes(state.task["course"], self.options.corridor_width)
+
     def _changes(self, task: dict[str, Any], x: Array) -> dict[str, Array]:
         changes = randomized_fields(self.physics.model, self.options.randomization, task["factors"])
         if "course" in task:
@@ -153,7 +163,10 @@ class Run:
         metrics = {"forward_velocity": speed, "height": height, "up": up}
         metrics |= {f"reward_{name}": term for name, term in terms.items()}
         task = task | {"center": center}
+        finished = jnp.zeros((), bool)
         if "course" in task:
+            # Beyond the end there is no ground; having run all of the corridor is no failure.
+            finished = healthy & (physics.qpos[0] >= self.parts.arena.length)
             crossed = jnp.maximum(gaps_crossed(task["course"], physics.qpos[0]), task["crossed"])
             # A body below its healthy height has fallen in, however far it flew.
             crossed = jnp.where(healthy, crossed, task["crossed"])
@@ -164,7 +177,7 @@ class Run:
             observation=self._observe(physics, readings, task, action),
             reward=sum(terms.values()),
             terminated=~healthy,
-            truncated=jnp.zeros((), bool),
+            truncated=finished,
             metrics=metrics,
             task=task,
         )

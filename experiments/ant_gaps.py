@@ -12,9 +12,9 @@ experiment = Experiment(
     build_env=run.build,
     env=run.Options(body="ant", arena="gaps"),
     build_network=networks.mlp,
-    network=networks.MlpOptions(policy_hidden=(128, 128), value_hidden=(256, 256)),
+    network=networks.MlpOptions(policy_hidden=(128, 128), value_hidden=(128, 128)),
     ppo=Config(
-        num_steps=6_000_000,
+        num_steps=3_000_000,
         num_envs=256,
         rollout_length=32,
         num_epochs=4,

@@ -12,7 +12,7 @@ experiment = Experiment(
     build_env=run.build,
     env=run.Options(body="ant"),
     build_network=networks.mlp,
-    network=networks.MlpOptions(policy_hidden=(128, 128), value_hidden=(256, 256)),
+    network=networks.MlpOptions(policy_hidden=(128, 128), value_hidden=(128, 128)),
     ppo=Config(
         num_steps=10_000_000,
         num_envs=256,

@@ -15,7 +15,7 @@ experiment = Experiment(
     # At a larger scale the control cost of 38 actuators outweighs being alive, and falling pays.
     network=networks.MlpOptions(policy_hidden=(256, 256), value_hidden=(256, 256), initial_std=0.3),
     ppo=Config(
-        num_steps=10_000_000,
+        num_steps=3_000_000,
         num_envs=128,
         rollout_length=64,
         num_epochs=4,

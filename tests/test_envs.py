@@ -175,6 +175,8 @@ def test_a_crossed_gap_is_counted_once_and_a_fall_is_not_a_crossing():
     across = move(state, beyond, 0.52)
     assert not across.terminated and across.metrics["gaps_crossed_count"] == 1
     assert move(across, beyond, 0.52).metrics["gaps_crossed_count"] == 0
+    ran_all = move(across, 40.0, 0.52)
+    assert ran_all.truncated and not ran_all.terminated and not across.truncated
     back = move(across, 5.0, 0.52)
     assert move(back, beyond, 0.52).metrics["gaps_crossed_count"] == 0
 
