@@ -28,7 +28,7 @@ def test_merge_equals_the_statistics_of_everything():
     rng = np.random.default_rng(0)
     # Means far from 0 and drifting: where a naive sum of squares loses all its digits.
     drift = np.linspace(0, 5, 300)[:, None, None, None]
-    batches = (rng.normal(size=(300, 4, 8, 3)) * [0.1, 1.0, 30.0] + [1000.0, 0.0, -5.0] + drift)
+    batches = rng.normal(size=(300, 4, 8, 3)) * [0.1, 1.0, 30.0] + [1000.0, 0.0, -5.0] + drift
     batches = batches.astype(np.float32)
     statistics = merged(batches)
     flat = batches.reshape(-1, 3).astype(np.float64)
