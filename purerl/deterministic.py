@@ -4,13 +4,13 @@ A scatter-add is atomic on a GPU: terms that meet at one address are added in wh
 arrive, so two runs differ in the last bits. MJX is full of them (children of a body, sparse mass
 matrices, tendons), and nearly all have indices that are known while tracing. Here the trace itself
 is rewritten: each scatter-add with constant indices becomes gathers added in the order of the
-updates. Nothing of MJX or JAX is patched, so nothing can leak into other code, and a new MJX that
-adds more scatter-adds is covered without being known here.
+updates, over the addresses that receive any. Nothing of MJX or JAX is patched, so nothing can leak
+into other code, and a new MJX that adds more scatter-adds is covered without being known here.
 """
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,17 +18,19 @@ import numpy as np
 from jax import lax
 from jax.extend import core
 
+from purerl.folding import (
+    CALLS,
+    Known,
+    bind_equation,
+    called_jaxpr,
+    fold,
+    known_constant,
+    known_literal,
+)
 from purerl.types import Array, PyTree
 
 _SUMS = ("scatter-add", "scatter_add", "scatter-mul", "scatter_mul", "scatter-sub", "scatter_sub")
-# Primitives that only call one jaxpr: their body can be run in place.
-_CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
-_CALLS |= {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "checkpoint": "jaxpr"}
-_CALLS |= {"remat2": "jaxpr", "remat": "jaxpr"}
-
 _FEW_TERMS = 4
-
-Known = Callable[[], np.ndarray] | None  # gives a value known while tracing
 
 
 class ScatterSum(NamedTuple):
@@ -53,9 +55,8 @@ def trace_deterministic(function: Callable, *example: PyTree) -> core.ClosedJaxp
       RuntimeError: a scatter sum is left whose order is not fixed.
     """
     closed = _prune(jax.make_jaxpr(function)(*example))
-    rewritten = functools.partial(
-        _evaluate, closed.jaxpr, closed.consts, [None] * len(closed.jaxpr.invars)
-    )
+    unknown = [None] * len(closed.jaxpr.invars)
+    rewritten = functools.partial(_evaluate, closed, unknown, {})
     result = _prune(jax.make_jaxpr(rewritten)(*closed.in_avals))
     left = list_scatter_sums(result)
     if left:
@@ -126,92 +127,69 @@ def _prune(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
 
 
 def _evaluate(
-    jaxpr: core.Jaxpr, consts: list[Any], known_args: list[Known], *args: Array
+    closed: core.ClosedJaxpr, known_args: list[Known], shared: dict, *args: Array
 ) -> list[Array]:
-    """Runs a trace with its scatter sums replaced; `known_args` are arguments known beforehand."""
-    values: dict[core.Var, Any] = {}
-    known: dict[core.Var, Known] = {}
+    """Runs a trace with its scatter sums replaced, and what is known computed beforehand.
+
+    Args:
+      closed: the trace.
+      known_args: how to get the arguments that are known beforehand.
+      shared: the constants of the whole program by content, so that each stands there once.
+      *args: the arguments.
+    """
+    closed = _prune(closed)
+    jaxpr, values, known = closed.jaxpr, {}, {}
 
     def read(atom):
-        return atom.val if isinstance(atom, core.Literal) else values[atom]
+        if isinstance(atom, core.Literal):
+            return atom.val
+        if atom not in values:
+            value = known[atom]()
+            content = (value.shape, value.dtype.str, value.tobytes())
+            values[atom] = shared.setdefault(content, value)
+        return values[atom]
 
     def read_known(atom):
-        if isinstance(atom, core.Literal):
-            return functools.partial(np.asarray, atom.val)
-        return known.get(atom)
+        return known_literal(atom) if isinstance(atom, core.Literal) else known.get(atom)
 
-    for var, const in zip(jaxpr.constvars, consts, strict=True):
-        values[var] = const
-        known[var] = _known_const(const)
-    for var, arg, known_arg in zip(jaxpr.invars, args, known_args, strict=True):
-        values[var], known[var] = arg, known_arg
+    values.update(zip(jaxpr.constvars, closed.consts, strict=True))
+    known.update(zip(jaxpr.constvars, map(known_constant, closed.consts), strict=True))
+    values.update(zip(jaxpr.invars, args, strict=True))
+    known.update(zip(jaxpr.invars, known_args, strict=True))
     for eqn in jaxpr.eqns:
-        inputs, known_inputs = [read(v) for v in eqn.invars], [read_known(v) for v in eqn.invars]
-        outputs, known_outputs = _apply(eqn, inputs, known_inputs)
+        known_inputs = [read_known(v) for v in eqn.invars]
+        folded = fold(eqn, known_inputs)
+        if folded is not None:
+            known.update(zip(eqn.outvars, folded, strict=True))
+            continue
+        outputs = _apply(eqn, [read(v) for v in eqn.invars], known_inputs, shared)
         values.update(zip(eqn.outvars, outputs, strict=True))
-        known.update(zip(eqn.outvars, known_outputs, strict=True))
     return [read(v) for v in jaxpr.outvars]
 
 
-def _known_const(const: Any) -> Known:
-    """A constant of the trace is known unless it is itself being traced."""
-    if isinstance(const, jax.core.Tracer) or not hasattr(const, "dtype"):
-        return None
-    # Only indices matter here: keys and floating-point tables need never be fetched.
-    integral = np.issubdtype(const.dtype, np.integer) or const.dtype == np.bool_
-    return functools.partial(np.asarray, const) if integral else None
-
-
-def _apply(eqn: core.JaxprEqn, inputs: list, known: list[Known]) -> tuple[list, list[Known]]:
+def _apply(eqn: core.JaxprEqn, inputs: list, known: list[Known], shared: dict) -> list:
     """Runs one equation, through the replacement for its kind where it has one."""
     name = eqn.primitive.name
-    unknown = [None] * len(eqn.outvars)
     if _is_unordered(eqn):
-        return [_ordered_scatter(eqn, inputs, known)], unknown
+        return [_ordered_scatter(eqn, inputs, known)]
     if not _has_scatter_sum(eqn):
-        return _bind(eqn, inputs), _fold(eqn, known)
-    if name in _CALLS:
-        inner = eqn.params[_CALLS[name]]
-        inner = inner if isinstance(inner, core.ClosedJaxpr) else core.ClosedJaxpr(inner, ())
-        return _evaluate(inner.jaxpr, inner.consts, known, *inputs), unknown
+        return bind_equation(eqn, inputs)
+    if name in CALLS:
+        return _evaluate(called_jaxpr(eqn), known, shared, *inputs)
     if name in _LOOPS:
-        return list(_LOOPS[name](eqn.params, inputs, known)), unknown
+        return list(_LOOPS[name](eqn.params, inputs, known, shared))
     raise RuntimeError(
         f"A sum without a fixed order stands inside {name!r}, which cannot be rewritten."
     )
 
 
-def _bind(eqn: core.JaxprEqn, inputs: list) -> list:
-    """Runs one equation as it is."""
-    params = eqn.primitive.get_bind_params(eqn.params)
-    # jax before 0.10 returned the called functions apart.
-    called, params = params if isinstance(params, tuple) else ((), params)
-    with eqn.ctx.manager:
-        outputs = eqn.primitive.bind(*called, *inputs, **params)
-    return list(outputs) if eqn.primitive.multiple_results else [outputs]
-
-
-def _fold(eqn: core.JaxprEqn, known: list[Known]) -> list[Known]:
-    """Says how to compute the results of an equation of known integers, if ever asked."""
-    unknown = [None] * len(eqn.outvars)
-    if eqn.effects or any(k is None for k in known):
-        return unknown
-
-    @functools.cache
-    def compute() -> list[np.ndarray]:
-        with jax.ensure_compile_time_eval():
-            return [np.asarray(v) for v in _bind(eqn, [jnp.asarray(k()) for k in known])]
-
-    return [functools.partial(lambda i: compute()[i], i) for i in range(len(eqn.outvars))]
-
-
-def _scan(params: dict, inputs: list, known: list[Known]) -> list:
+def _scan(params: dict, inputs: list, known: list[Known], shared: dict) -> list:
     """`lax.scan` with a rewritten body."""
     body, (n, m) = params["jaxpr"], _scan_sizes(params)
     known_body = known[:n] + [None] * (len(inputs) - n)
 
     def step(carry, x):
-        out = _evaluate(body.jaxpr, body.consts, known_body, *inputs[:n], *carry, *x)
+        out = _evaluate(body, known_body, shared, *inputs[:n], *carry, *x)
         return out[:m], out[m:]
 
     carry, xs = list(inputs[n : n + m]), list(inputs[n + m :])
@@ -229,7 +207,7 @@ def _scan_sizes(params: dict) -> tuple[int, int]:
     return len(consts), len(carry)
 
 
-def _while(params: dict, inputs: list, known: list[Known]) -> list:
+def _while(params: dict, inputs: list, known: list[Known], shared: dict) -> list:
     """`lax.while_loop` with a rewritten condition and body."""
     n, m = params["cond_nconsts"], params["body_nconsts"]
     test, body = params["cond_jaxpr"], params["body_jaxpr"]
@@ -237,21 +215,17 @@ def _while(params: dict, inputs: list, known: list[Known]) -> list:
     unknown = [None] * len(carry)
 
     def condition(c):
-        return _evaluate(test.jaxpr, test.consts, known[:n] + unknown, *inputs[:n], *c)[0]
+        return _evaluate(test, known[:n] + unknown, shared, *inputs[:n], *c)[0]
 
     def step(c):
-        return _evaluate(
-            body.jaxpr, body.consts, known[n : n + m] + unknown, *inputs[n : n + m], *c
-        )
+        return _evaluate(body, known[n : n + m] + unknown, shared, *inputs[n : n + m], *c)
 
     return lax.while_loop(condition, step, carry)
 
 
-def _cond(params: dict, inputs: list, known: list[Known]) -> list:
+def _cond(params: dict, inputs: list, known: list[Known], shared: dict) -> list:
     """`lax.switch` with rewritten branches."""
-    branches = [
-        functools.partial(_evaluate, b.jaxpr, b.consts, known[1:]) for b in params["branches"]
-    ]
+    branches = [functools.partial(_evaluate, b, known[1:], shared) for b in params["branches"]]
     index = inputs[0].astype(jnp.int32) if hasattr(inputs[0], "astype") else inputs[0]
     return lax.switch(index, branches, *inputs[1:])
 
@@ -272,59 +246,84 @@ def _ordered_scatter(eqn: core.JaxprEqn, inputs: list, known: list[Known]) -> Ar
             "only while running, so its sum has no fixed order on a GPU. Ask for fewer readings, "
             "or change the model so that MJX does not need it."
         )
-    order = _order_of_sums(_addresses(eqn, known[1]()), operand.size)
-    total, flat = jnp.reshape(operand, (-1,)), jnp.reshape(updates, (-1,))
-    if len(order) <= _FEW_TERMS:
-        for turn in order:
-            total = total + _terms(flat, turn)
+    addresses = _addresses(eqn, np.asarray(known[1]()))
+    touched, turns = _order_of_sums(addresses, updates.size)
+    whole, flat = jnp.reshape(operand, (-1,)), jnp.reshape(updates, (-1,))
+    if (turns == updates.size).any():
+        flat = jnp.concatenate([flat, jnp.zeros(1, flat.dtype)])
+    total = _take(whole, touched)
+    if len(turns) <= _FEW_TERMS:
+        for turn in turns:
+            total = total + _take(flat, turn)
     else:
         # One gather and one reduction: a long chain of sums takes XLA minutes to compile.
-        total = total + jnp.sum(_terms(flat, np.stack(order)), axis=0)
-    return jnp.reshape(total, operand.shape)
+        total = total + jnp.sum(_take(flat, turns), axis=0)
+    place = np.arange(operand.size)
+    place[touched] = operand.size + np.arange(len(touched))
+    return jnp.reshape(_take(jnp.concatenate([whole, total]), place), operand.shape)
 
 
-def _terms(flat: Array, update: np.ndarray) -> Array:
-    """Takes the updates of the given numbers, 0 where there is none (-1)."""
-    present = update >= 0
-    terms = flat[np.maximum(update, 0)]
-    return terms if present.all() else jnp.where(present, terms, 0)
+def _take(flat: Array, index: np.ndarray) -> Array:
+    """`flat[index]` of constant indices within bounds, as one operation."""
+    first = index.flat[0] if index.size else 0
+    if index.ndim == 1 and (index == first + np.arange(index.size)).all():
+        return lax.slice(flat, (first,), (first + index.size,))
+    numbers = lax.GatherDimensionNumbers((), (0,), (0,))
+    index = index.astype(np.int32)[..., None]
+    return lax.gather(flat, index, numbers, (1,), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
 
 
 def _addresses(eqn: core.JaxprEqn, indices: np.ndarray) -> np.ndarray:
     """Returns for each update the flat address it is added to; -1 where it is dropped.
 
-    A gather over the addresses themselves, with the scatter's own dimension numbers: it is the
-    exact transpose, so no rule about windows has to be repeated here.
+    By XLA's definition of a scatter: each index vector says where a window of updates starts, and
+    a window that does not fit is dropped whole, or moved until it fits (mode CLIP).
     """
-    operand, _, updates = (v.aval for v in eqn.invars)
+    shape, updates = eqn.invars[0].aval.shape, eqn.invars[2].aval
     d = eqn.params["dimension_numbers"]
-    absent = set(d.inserted_window_dims) | set(d.operand_batching_dims)
-    window = iter(updates.shape[i] for i in d.update_window_dims)
-    sizes = tuple(1 if i in absent else next(window) for i in range(len(operand.shape)))
-    numbers = lax.GatherDimensionNumbers(
-        offset_dims=d.update_window_dims,
-        collapsed_slice_dims=d.inserted_window_dims,
-        start_index_map=d.scatter_dims_to_operand_dims,
-        operand_batching_dims=d.operand_batching_dims,
-        start_indices_batching_dims=d.scatter_indices_batching_dims,
+    batch_axes = [i for i in range(len(updates.shape)) if i not in d.update_window_dims]
+    batch = tuple(updates.shape[i] for i in batch_axes)
+    absent = (*d.inserted_window_dims, *d.operand_batching_dims)
+    axis_of = dict(
+        zip([i for i in range(len(shape)) if i not in absent], d.update_window_dims, strict=True)
     )
-    clip = eqn.params["mode"] == lax.GatherScatterMode.CLIP
-    mode = "clip" if clip else "fill"
-    with jax.ensure_compile_time_eval():
-        table = jnp.arange(int(np.prod(operand.shape)), dtype=jnp.int32).reshape(operand.shape)
-        found = lax.gather(table, jnp.asarray(indices), numbers, sizes, mode=mode, fill_value=-1)
-        return np.asarray(found).reshape(-1)
+    starts = np.zeros((len(shape), *batch), np.int64)
+    for column, dim in enumerate(d.scatter_dims_to_operand_dims):
+        starts[dim] = indices[..., column]
+    for dim, axis in zip(d.operand_batching_dims, d.scatter_indices_batching_dims, strict=True):
+        starts[dim] = np.indices(batch)[axis]
+    sizes = [updates.shape[axis_of[i]] if i in axis_of else 1 for i in range(len(shape))]
+    room = (np.array(shape) - sizes).reshape(-1, *[1] * len(batch)).astype(np.int64)
+    if eqn.params["mode"] == lax.GatherScatterMode.CLIP:
+        starts = np.clip(starts, 0, room)
+    fits = ((starts >= 0) & (starts <= room)).all(0)
+    address = np.zeros(updates.shape, np.int64)
+    steps = np.cumprod([1, *shape[:0:-1]])[::-1] if shape else []
+    spread = tuple(i for i in range(len(updates.shape)) if i not in batch_axes)
+    for dim, step in enumerate(steps):
+        address += step * np.expand_dims(starts[dim], spread)
+        if dim in axis_of:
+            along = [1] * len(updates.shape)
+            along[axis_of[dim]] = sizes[dim]
+            address += step * np.arange(sizes[dim]).reshape(along)
+    return np.where(np.expand_dims(fits, spread), address, -1).reshape(-1)
 
 
-def _order_of_sums(address: np.ndarray, size: int) -> list[np.ndarray]:
-    """Splits the updates by turn: `result[k][a]` is the k-th update of address a, or -1."""
-    turns = np.zeros(size, np.int32)
-    order: list[np.ndarray] = []
-    for update, target in enumerate(address):
-        if target < 0:
-            continue
-        if turns[target] == len(order):
-            order.append(np.full(size, -1, np.int32))
-        order[turns[target]][target] = update
-        turns[target] += 1
-    return order
+def _order_of_sums(address: np.ndarray, none: int) -> tuple[np.ndarray, np.ndarray]:
+    """Sorts updates by the address that they are added to.
+
+    Args:
+      address: [updates]; -1 where an update is dropped.
+      none: what stands for no update.
+
+    Returns:
+      The addresses that receive any, [touched], ascending; and the number of the k-th update of
+      each, [turns, touched].
+    """
+    kept = np.flatnonzero(address >= 0)
+    order = kept[np.argsort(address[kept], kind="stable")]
+    touched, start, count = np.unique(address[order], return_index=True, return_counts=True)
+    turns = np.full((count.max(initial=0), len(touched)), none)
+    turn = np.arange(len(order)) - np.repeat(start, count)
+    turns[turn, np.repeat(np.arange(len(touched)), count)] = order
+    return touched, turns

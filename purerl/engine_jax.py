@@ -1,6 +1,7 @@
 """The `jax` engine: MJX, traced once, with every sum in a fixed order."""
 
 import contextlib
+import io
 from collections.abc import Callable
 from typing import Any
 
@@ -9,11 +10,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax.extend import core
-from mujoco import mjx
-from mujoco.mjx._src import forward, sensor, smooth
 
 from purerl.deterministic import trace_deterministic
 from purerl.types import Array, PyTree
+
+with contextlib.redirect_stdout(io.StringIO()):  # it prints that warp, which is optional, is absent
+    from mujoco import mjx
+    from mujoco.mjx._src import forward, sensor, smooth
 
 _IN_IMPL = ("cinert", "crb", "ten_velocity", "actuator_velocity", "subtree_linvel")
 _IN_IMPL += ("subtree_angmom", "cacc", "cfrc_int", "cfrc_ext")

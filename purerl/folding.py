@@ -1,0 +1,144 @@
+"""Values of a trace that are known before it runs: integers and truth values made of constants.
+
+MJX computes its indices from constants with JAX operations, tens of thousands of them in a large
+model. Here they are computed once, with numpy: JAX would compile a small program for each shape.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core
+
+Known = Callable[[], np.ndarray] | None  # gives a value known while tracing
+
+# Primitives that only call one jaxpr: their body can be run in place.
+CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
+CALLS |= {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "checkpoint": "jaxpr"}
+CALLS |= {"remat2": "jaxpr", "remat": "jaxpr"}
+
+
+def known_constant(const: Any) -> Known:
+    """A constant of the trace is known unless it is itself being traced."""
+    if isinstance(const, jax.core.Tracer) or not hasattr(const, "dtype"):
+        return None
+    # Only indices matter here: keys and floating-point tables need never be fetched.
+    return functools.partial(np.asarray, const) if _is_integral(const.dtype) else None
+
+
+def known_literal(literal: core.Literal) -> Known:
+    """Gives the value of a literal."""
+    return functools.partial(np.asarray, literal.val, literal.aval.dtype)
+
+
+def called_jaxpr(eqn: core.JaxprEqn) -> core.ClosedJaxpr:
+    """Returns what an equation of `CALLS` calls."""
+    inner = eqn.params[CALLS[eqn.primitive.name]]
+    return inner if isinstance(inner, core.ClosedJaxpr) else core.ClosedJaxpr(inner, ())
+
+
+def fold(eqn: core.JaxprEqn, known: list[Known]) -> list[Known] | None:
+    """Says how to compute an equation's results, if ever asked; None where they are not known."""
+    if eqn.effects or any(k is None for k in known):
+        return None
+    if not all(_is_integral(v.aval.dtype) for v in eqn.outvars):
+        return None
+
+    @functools.cache
+    def compute() -> list[np.ndarray]:
+        return _compute(eqn, [k() for k in known])
+
+    return [functools.partial(lambda i: compute()[i], i) for i in range(len(eqn.outvars))]
+
+
+def bind_equation(eqn: core.JaxprEqn, inputs: list) -> list:
+    """Runs one equation as it is."""
+    params = eqn.primitive.get_bind_params(eqn.params)
+    # jax before 0.10 returned the called functions apart.
+    called, params = params if isinstance(params, tuple) else ((), params)
+    with eqn.ctx.manager:
+        outputs = eqn.primitive.bind(*called, *inputs, **params)
+    return list(outputs) if eqn.primitive.multiple_results else [outputs]
+
+
+def _is_integral(dtype: Any) -> bool:
+    return jnp.issubdtype(dtype, jnp.integer) or dtype == jnp.bool_
+
+
+def _compute(eqn: core.JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
+    """Computes one equation of known inputs."""
+    rule = _RULES.get(eqn.primitive.name)
+    if eqn.primitive.name in CALLS:
+        outputs = _compute_jaxpr(called_jaxpr(eqn), values)
+    elif rule and all(_is_integral(v.dtype) for v in values):
+        outputs = [rule(eqn.params, *values)]
+    else:
+        with jax.ensure_compile_time_eval():
+            outputs = bind_equation(eqn, [jnp.asarray(v) for v in values])
+    return [np.asarray(x, v.aval.dtype) for x, v in zip(outputs, eqn.outvars, strict=True)]
+
+
+def _compute_jaxpr(closed: core.ClosedJaxpr, values: list[np.ndarray]) -> list[np.ndarray]:
+    found = dict(zip(closed.jaxpr.constvars, map(np.asarray, closed.consts), strict=True))
+    found |= dict(zip(closed.jaxpr.invars, values, strict=True))
+
+    def read(atom):
+        return known_literal(atom)() if isinstance(atom, core.Literal) else found[atom]
+
+    for eqn in closed.jaxpr.eqns:
+        outputs = _compute(eqn, [read(v) for v in eqn.invars])
+        found.update(zip(eqn.outvars, outputs, strict=True))
+    return [read(v) for v in closed.jaxpr.outvars]
+
+
+def _broadcast(p: dict, x: np.ndarray) -> np.ndarray:
+    shape = [1] * len(p["shape"])
+    for size, place in zip(x.shape, p["broadcast_dimensions"], strict=True):
+        shape[place] = size
+    return np.broadcast_to(x.reshape(shape), p["shape"])
+
+
+def _slice(p: dict, x: np.ndarray) -> np.ndarray:
+    strides = p["strides"] or (1,) * x.ndim
+    limits = zip(p["start_indices"], p["limit_indices"], strides, strict=True)
+    return x[tuple(slice(*s) for s in limits)]
+
+
+def _remainder(p: dict, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    # As XLA has it: the sign of the dividend; x for y = 0.
+    return np.where(y == 0, x, np.fmod(x, np.where(y == 0, 1, y)))
+
+
+def _select(p: dict, which: np.ndarray, *cases: np.ndarray) -> np.ndarray:
+    return np.choose(which.astype(np.int32), cases)
+
+
+# Integer arithmetic wraps around in numpy as in XLA.
+_RULES: dict[str, Callable[..., np.ndarray]] = {
+    name: functools.partial(lambda f, p, *values: f(*values), function)
+    for name, function in {
+        "add": np.add,
+        "sub": np.subtract,
+        "mul": np.multiply,
+        "neg": np.negative,
+        "max": np.maximum,
+        "min": np.minimum,
+        "lt": np.less,
+        "le": np.less_equal,
+        "gt": np.greater,
+        "ge": np.greater_equal,
+        "eq": np.equal,
+        "ne": np.not_equal,
+        "and": np.bitwise_and,
+        "or": np.bitwise_or,
+        "not": np.invert,
+    }.items()
+}
+_RULES |= {"broadcast_in_dim": _broadcast, "slice": _slice, "rem": _remainder, "select_n": _select}
+_RULES["convert_element_type"] = lambda p, x: x.astype(p["new_dtype"])
+_RULES["squeeze"] = lambda p, x: np.squeeze(x, p["dimensions"])
+_RULES["transpose"] = lambda p, x: np.transpose(x, p["permutation"])
+_RULES["concatenate"] = lambda p, *xs: np.concatenate(xs, p["dimension"])
