@@ -14,7 +14,7 @@ experiment = Experiment(
     build_network=networks.mlp,
     network=networks.MlpOptions(policy_hidden=(128, 128), value_hidden=(128, 128)),
     ppo=Config(
-        num_steps=10_000_000,
+        num_steps=5_000_000,
         num_envs=256,
         rollout_length=32,
         num_epochs=4,

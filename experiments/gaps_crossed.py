@@ -1,0 +1,100 @@
+"""How many gaps a policy crosses in corridors that it has never seen, beside simpler policies.
+
+    python -m experiments.gaps_crossed runs/rodent_gaps/seed1 --floor-run runs/rodent_run/seed1
+
+The floor policy is one trained without gaps: put into the corridor, it does not see them (what
+lies ahead stands at the end of the observation, and is cut off). "Still" holds all actions at 0.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from purerl import rundir
+from purerl.evaluation import evaluate
+from purerl.keys import Purpose, derive
+from purerl.types import Array, Network, Normal, PolicyOutput, TrainState
+
+
+def gaps_of(setup: rundir.Setup, state: TrainState, seed: int, episodes: int) -> dict[str, Any]:
+    """Evaluates deterministically in `episodes` corridors; the same seed gives the same ones."""
+
+    def judge(state: TrainState, key: Array) -> dict[str, Array]:
+        return evaluate(setup.config, setup.env, setup.network, state, key, episodes)
+
+    key = derive(jax.random.key(seed), Purpose.EVALUATION)
+    return jax.device_get(jax.jit(judge)(state, key))
+
+
+def blind(network: Network, size: int) -> Network:
+    """Lets a network of `size` observation features act on observations with more at the end."""
+    return Network(
+        network.init,
+        lambda params, observation, carry: network.apply(params, observation[..., :size], carry),
+    )
+
+
+def widen(state: TrainState, extra: int) -> TrainState:
+    """Gives a state's observation statistics `extra` features that nothing reads."""
+    pad = lambda x: jnp.pad(x, (0, extra), constant_values=1.0)  # noqa: E731
+    statistics = state.normalizer
+    mean, variance = jax.tree.map(pad, (statistics.mean, statistics.variance))
+    return state.replace(normalizer=statistics.replace(mean=mean, variance=variance))
+
+
+def still(action_size: int) -> Network:
+    """A network whose deterministic action is 0."""
+
+    def apply(params: Any, observation: Array, carry: Any) -> tuple[PolicyOutput, Any]:
+        zero = jnp.zeros((*observation.shape[:-1], action_size))
+        return PolicyOutput(Normal(zero, zero + 1.0), observation[..., 0] * 0.0), carry
+
+    return Network(lambda key: ((), ()), apply)
+
+
+def report(name: str, result: dict[str, Any]) -> str:
+    """Formats one policy's distribution of gaps crossed."""
+    gaps = result["gaps_crossed_count"]
+    quantiles = np.quantile(gaps, [0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0])
+    figures = " | ".join(f"{q:.0f}" for q in quantiles)
+    some, five = np.mean(gaps >= 1), np.mean(gaps >= 5)
+    speed = result["forward_velocity"].mean()
+    return f"| {name} | {gaps.mean():.1f} | {some:.0%} | {five:.0%} | {figures} | {speed:.2f} |"
+
+
+def main(arguments: list[str]) -> int:
+    """Prints a table of all policies."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", type=Path, help="a run in a corridor")
+    parser.add_argument("--floor-run", type=Path, help="a run of the same body on a floor")
+    parser.add_argument("--episodes", type=int, default=128, help="corridors")
+    parser.add_argument("--seed", type=int, default=12345, help="draws the corridors")
+    options = parser.parse_args(arguments)
+    trained = rundir.restore(options.run, "latest", print)
+    setup, state = trained.setup, trained.saved.state
+    policies = {"trained": (setup, state)}
+    if options.floor_run:
+        floor = rundir.restore(options.floor_run, "latest", print)
+        size = floor.saved.state.env.observation.shape[-1]
+        extra = state.env.observation.shape[-1] - size
+        network = blind(floor.setup.network, size)
+        policies["floor"] = setup._replace(network=network), widen(floor.saved.state, extra)
+    policies["still"] = setup._replace(network=still(setup.env.action_size)), state
+    limit = setup.config.episode_length * setup.env.control_timestep
+    print(f"{options.episodes} corridors, at most {limit:.0f} s each, deterministic policies")
+    print("| policy | gaps, mean | >= 1 | >= 5 | min | 10% | 25% | 50% | 75% | 90% | max | m/s |")
+    print("|" + "---|" * 12)
+    for name, (policy, its_state) in policies.items():
+        print(report(name, gaps_of(policy, its_state, options.seed, options.episodes)), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
