@@ -2,7 +2,7 @@
 
 Every difference from what dm_control would compile is one function here, with its reason: first
 those made to the MJCF, then those made to the compiled model. They are the same for every engine;
-only the number of solver iterations differs (`set_solver`).
+only the solver's settings differ (`set_solver`).
 """
 
 import dataclasses
@@ -55,7 +55,7 @@ def compose(
     Args:
       body: of `envs.bodies`.
       arena: of `envs.arenas`.
-      engine: as for `purerl.physics.Physics`; decides the solver's iterations only.
+      engine: as for `purerl.physics.Physics`; decides the solver's settings only.
       timestep: of physics [s]; the body's own if None.
       self_collision: whether parts of the body can touch each other.
       sensors: names of the body's sensors to keep.
@@ -193,12 +193,16 @@ def set_solver(model: mujoco.MjModel, engine: str, timestep: float) -> None:
     """Newton's method, pyramidal cones, `timestep` [s].
 
     dm_control's arenas have elliptic cones, which cost MJX more for no gain in these tasks.
-    Implicit damping (eulerdamp) stays on: without it the rodent is NaN at once.
+    Implicit damping (eulerdamp) stays on: without it the rodent is NaN at once. For MJX matrices
+    are dense: a body of 60 degrees of freedom and more gets sparse ones by default, which bring
+    more sums whose order has to be fixed, and a larger program, for no gain in speed.
     """
     model.opt.timestep = timestep
     model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
     model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     model.opt.iterations, model.opt.ls_iterations = ITERATIONS[engine]
+    if engine == "jax":
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
 
 
 def check_contacts(model: mujoco.MjModel, body: Body) -> None:

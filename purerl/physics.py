@@ -1,7 +1,6 @@
 """MuJoCo behind one small stateless interface, whatever the engine."""
 
 import collections
-import functools
 from typing import Any
 
 import jax
@@ -33,6 +32,28 @@ _ACCELERATION: tuple[str, ...] = ("qacc", "act_dot", "actuator_force", "qfrc_act
 _ACCELERATION += ("qfrc_smooth",)
 _ACCELERATION += ("qacc_smooth", "qfrc_constraint", "cacc", "cfrc_int", "cfrc_ext")
 READINGS = (*_POSITION, *_VELOCITY, *_ACCELERATION, "sensordata")
+
+# Fields of MjModel that may differ between environments, on every engine: a test compares them with
+# those that MJX traces, so that the `c` engine need not import MJX, which takes seconds.
+CHANGEABLE_FIELDS = tuple(
+    """
+    actuator_acc0 actuator_actrange actuator_biasprm actuator_cranklength actuator_ctrlrange
+    actuator_dynprm actuator_forcerange actuator_gainprm actuator_gear actuator_lengthrange
+    body_gravcomp body_inertia body_invweight0 body_ipos body_iquat body_mass body_pos body_quat
+    body_subtreemass cam_fovy cam_intrinsic cam_mat0 cam_pos cam_pos0 cam_poscom0 cam_quat dof_M0
+    dof_armature dof_damping dof_dampingpoly dof_frictionloss dof_invweight0 dof_solimp dof_solref
+    eq_data eq_solimp eq_solref geom_aabb geom_friction geom_gap geom_margin geom_pos geom_quat
+    geom_rbound geom_rgba geom_size geom_solimp geom_solmix geom_solref jnt_actfrcrange jnt_axis
+    jnt_margin jnt_pos jnt_range jnt_solimp jnt_solref jnt_stiffness jnt_stiffnesspoly
+    light_ambient light_attenuation light_cutoff light_diffuse light_dir light_dir0 light_exponent
+    light_pos light_pos0 light_poscom0 light_specular mat_emission mat_rgba mat_shininess
+    mat_specular pair_friction pair_gap pair_margin pair_solimp pair_solref pair_solreffriction
+    qpos0 qpos_spring site_pos site_quat tendon_actfrcrange tendon_armature tendon_damping
+    tendon_dampingpoly tendon_frictionloss tendon_invweight0 tendon_length0 tendon_lengthspring
+    tendon_margin tendon_range tendon_solimp_fri tendon_solimp_lim tendon_solref_fri
+    tendon_solref_lim tendon_stiffness tendon_stiffnesspoly
+    """.split()  # noqa: SIM905
+)
 
 _S = mujoco.mjtSensor
 # Fields that MuJoCo computes only for the sake of a sensor: without one they hold old values.
@@ -139,9 +160,9 @@ class Physics:
 
     def _check_changes(self, changes: dict[str, Array] | None) -> dict[str, Array]:
         for name, value in (changes or {}).items():
-            valid = changeable_fields()
-            if name not in valid:
-                raise ValueError(unknown_name("model field that can change", name, valid))
+            if name not in CHANGEABLE_FIELDS:
+                what = "model field that can change"
+                raise ValueError(unknown_name(what, name, CHANGEABLE_FIELDS))
             _check_shape(f"changes[{name!r}]", value, getattr(self.model, name).shape)
         return {name: _float32(value) for name, value in (changes or {}).items()}
 
@@ -182,17 +203,6 @@ def _stage(model: mujoco.MjModel, readings: tuple[str, ...]) -> int:
     early = model.sensor_needstage[model.sensor_needstage <= int(mujoco.mjtStage.mjSTAGE_VEL)]
     sensors = int(early.max()) if "sensordata" in readings and early.size else 0
     return max(stage, sensors)
-
-
-@functools.cache
-def changeable_fields() -> tuple[str, ...]:
-    """Returns the MjModel fields that may differ between environments, on every engine."""
-    from mujoco.batch import MODEL_FIELDS
-    from mujoco.mjx._src.types import Model
-
-    floats = {name for name, kind in Model.__annotations__.items() if kind is jax.Array}
-    integers = ("geom_matid", "light_type", "light_active", "light_castshadow", "mat_texid")
-    return tuple(sorted((floats & set(MODEL_FIELDS)) - set(integers)))
 
 
 def _check_model(model: mujoco.MjModel, readings: tuple[str, ...]) -> None:

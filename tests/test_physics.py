@@ -1,6 +1,8 @@
 """Engines behind `Physics`: what they promise, against MuJoCo itself and against each other."""
 
 import functools
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -9,9 +11,10 @@ import numpy as np
 import pytest
 from dm_control import suite
 
+from envs import run
 from purerl import model as lookup
 from purerl.deterministic import list_scatter_sums, trace_deterministic
-from purerl.physics import READINGS, Physics, choose_engine
+from purerl.physics import CHANGEABLE_FIELDS, READINGS, Physics, choose_engine
 
 # Two legs that touch a floor, a ball, a tendon, a filtered motor, a mocap body and sensors.
 XML = """
@@ -131,6 +134,44 @@ def test_engines_agree_on_every_reading():
         np.testing.assert_allclose(x / scale, y / scale, atol=2e-3)
 
 
+def test_a_velocity_is_current_whatever_else_is_read():
+    """Together with others a reading may be current only because another one asked for it."""
+    model = biped()
+    for name in ("cvel", "qfrc_bias", "actuator_velocity"):
+        p = Physics(model, (name,), substeps=3, engine="c")
+        state, _ = p.init(*(x[0] for x in starts(1, model)))
+        state, readings = p.step(state, jnp.ones(model.nu))
+        data = mujoco.MjData(model)
+        data.qpos, data.qvel, data.act = state.qpos, state.qvel, state.act
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(getattr(readings, name), getattr(data, name), 1e-3, 1e-4)
+
+
+def test_the_fields_that_may_change_are_those_that_mjx_traces():
+    from mujoco.batch import MODEL_FIELDS
+    from mujoco.mjx._src.types import Model
+
+    floats = {name for name, kind in Model.__annotations__.items() if kind is jax.Array}
+    integers = {"geom_matid", "light_type", "light_active", "light_castshadow", "mat_texid"}
+    assert set(CHANGEABLE_FIELDS) == (floats & set(MODEL_FIELDS)) - integers
+
+
+@pytest.mark.parametrize("engine", ["c", "jax"])
+def test_mjx_is_imported_by_its_engine_alone_and_quietly(engine):
+    code = f"""
+import sys, mujoco, numpy as np
+from purerl.physics import Physics
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body><freejoint/><geom size='.1'/>"
+    "</body></worldbody></mujoco>")
+physics = Physics(model, ("xpos",), engine="{engine}")
+physics._check_changes({{"body_mass": np.ones(2)}})
+assert ("mujoco.mjx" in sys.modules) == ("{engine}" == "jax")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr
+    assert "Failed to import" not in done.stderr
+
+
 def test_batching_changes_no_bit_on_c():
     p = physics("c")
     qpos, qvel = starts(6, p.model)
@@ -231,17 +272,49 @@ def rough(x):
     branch = jax.lax.cond(x[0] > 0, add, lambda c: c, jnp.ones(5))
     segments = jax.vmap(lambda y: jax.ops.segment_sum(y, index[:3], 4))(x[:6].reshape(2, 3))
     many = jnp.zeros(2).at[np.zeros(12, int)].add(jnp.tile(x[:6], 2))
-    return rows, looped, whiled, scanned, branch, segments, many
+    corners = jax.vmap(lambda c, i: jax.lax.dynamic_slice(c, i, (2, 2)), (None, 0))
+    overlap = jax.vjp(lambda c: corners(c, np.array([[0, 1], [1, 0], [9, 9]])), jnp.ones((3, 4)))
+    clipped = overlap[1](x.repeat(2)[:12].reshape(3, 2, 2))[0]
+    own = jax.vmap(lambda y, i: jnp.zeros((3, 2)).at[i, 1].add(y))  # batch axes of a scatter
+    batched = own(x[:6].reshape(2, 3), np.array([[0, 0, 2], [1, 2, 1]]))
+    tables = jax.vmap(lambda y: own(y, np.array([[0, 0, 2], [1, 2, -1]])))(x[:6].reshape(1, 2, 3))
+    return rows, looped, whiled, scanned, branch, segments, many, clipped, batched, tables
 
 
 def test_rewritten_sums_are_the_same_sums():
     x = jax.random.uniform(jax.random.key(0), (8,))
     closed = trace_deterministic(rough, x)
-    assert len(list_scatter_sums(jax.make_jaxpr(rough)(x))) >= 7
+    assert len(list_scatter_sums(jax.make_jaxpr(rough)(x))) >= 10
     assert not list_scatter_sums(closed)
     rewritten = jax.jit(jax.vmap(jax.extend.core.jaxpr_as_fun(closed)))(jnp.stack([x, -x]))
     for got, one, two in zip(rewritten, rough(x), rough(-x), strict=True):
         np.testing.assert_allclose(got, jnp.stack([one, two]), rtol=1e-5)
+
+
+def indices(x):
+    """Integer arithmetic on constants of every kind that MJX has, and gathers where it leads."""
+    i = jnp.arange(-6, 6)
+    parts = [i % 4, i // 4, jnp.where(i > 2, i, -i), jnp.clip(i, -1, 3), jax.lax.rem(i, 4)]
+    parts += [jnp.concatenate([i[::3], i[2:4]]), i.reshape(3, 4).T[1], i[None].repeat(2, 0)[0]]
+    parts += [jnp.minimum(i, 2) * jnp.sign(i), jnp.invert(i), (i == 2) | ~(i < 0), i.astype(bool)]
+    parts += [jnp.cumsum(i), jnp.zeros(4, jnp.int32).at[np.array([1, 1, 3])].add(2), jnp.abs(i)]
+    return [(part, x[part.astype(jnp.int32)]) for part in parts]
+
+
+def test_known_integers_are_computed_as_jax_computes_them():
+    def both(x):  # the sum makes the rewriting enter a loop, whose body knows the integers too
+        loop = jax.lax.fori_loop(0, 2, lambda i, c: c.at[np.array([0, 0])].add(1.0), x)
+        return indices(x), indices(loop)
+
+    x = jax.random.uniform(jax.random.key(0), (8,))
+    closed = trace_deterministic(both, x)
+    for got, want in zip(
+        jax.extend.core.jaxpr_as_fun(closed)(x), jax.tree.leaves(both(x)), strict=True
+    ):
+        assert got.dtype == want.dtype
+        np.testing.assert_array_equal(got, want)
+    names = {eqn.primitive.name for eqn in closed.jaxpr.eqns}
+    assert not names & {"rem", "select_n", "cumsum", "lt"}, "left for the compiler"
 
 
 def test_a_sum_at_indices_known_only_later_is_refused():
@@ -265,6 +338,18 @@ def test_no_scatter_sum_is_left_in_a_humanoid(jacobian):
     lookup.use_pyramidal_cone(model)
     model.opt.jacobian = {"dense": 0, "sparse": 1}[jacobian]
     assert len(list_scatter_sums(step_trace(model, rewritten=False))) > 20
+    assert not list_scatter_sums(step_trace(model, rewritten=True))
+
+
+@pytest.mark.parametrize("body", ["ant", "rodent"])
+def test_no_scatter_sum_is_left_in_the_bodies_of_dm_control(body):
+    env = run.build(run.Options(body=body), engine="jax")
+    assert not list_scatter_sums(step_trace(env.physics.model, True, run.READINGS))
+
+
+def test_no_scatter_sum_is_left_in_a_cartpole():
+    model = suite.load("cartpole", "swingup").physics.model.ptr
+    model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)  # MJX has none
     assert not list_scatter_sums(step_trace(model, rewritten=True))
 
 
