@@ -13,7 +13,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -178,23 +178,50 @@ def newest(
       set_aside: rename damaged ones to `damaged-<n>-<update>`; False for readers of a run that
         may be another process's.
     """
-    for update in reversed(updates(folder)):
-        path = folder / f"{update:012d}"
-        try:
-            return load(path, abstract)
-        except DamagedError as error:
-            kept = _set_aside(path) if set_aside else path
-            say(f"Checkpoint of update {update} is damaged: {error}. It is kept as {kept}; "
-                "using the one before it.")  # fmt: skip
-    return None
+    found = newest_of_all([folder], abstract, say, set_aside)
+    return found[0] if found else None
 
 
-def retain(folder: Path, keep: int) -> None:
-    """Deletes all but the newest `keep` checkpoints and the best one by evaluation."""
-    found = updates(folder)
+def newest_of_all(
+    folders: Sequence[Path], abstract: PyTree, say: Callable[[str], None], set_aside: bool = True
+) -> list[Saved]:
+    """Reads the newest update that all folders hold whole: of seeds that train together."""
+    for update in reversed(common_updates(folders)):
+        found = []
+        for folder in folders:
+            path = folder / f"{update:012d}"
+            try:
+                found.append(load(path, abstract))
+            except DamagedError as error:
+                kept = _set_aside(path) if set_aside else path
+                say(f"Checkpoint of update {update} is damaged: {error}. It is kept as {kept}; "
+                    "using the one before it.")  # fmt: skip
+        if len(found) == len(folders):
+            return found
+    return []
+
+
+def common_updates(folders: Iterable[Path]) -> list[int]:
+    """Returns the updates of which all folders have a checkpoint, oldest first."""
+    return sorted(set.intersection(*(set(updates(folder)) for folder in folders)))
+
+
+def retain(folder: Path, keep: int, together: Sequence[Path] = ()) -> None:
+    """Deletes all but the newest `keep` checkpoints and the best one by evaluation.
+
+    With the folders of seeds that train `together`, those count that all of them have.
+    """
     best = best_update(folder)
-    for update in found[:-keep] if keep else []:
-        if update != best:
+    newest = common_updates([folder, *together])[-keep:]
+    for update in updates(folder):
+        if newest and update < newest[0] and update != best:
+            discard(folder / f"{update:012d}")
+
+
+def forget_after(folder: Path, last: int) -> None:
+    """Deletes the checkpoints after update `last`, which other seeds did not come to save."""
+    for update in updates(folder):
+        if update > last:
             discard(folder / f"{update:012d}")
 
 

@@ -18,14 +18,15 @@ SECONDS_BETWEEN_LINES = 2.0
 
 
 def describe_plan(
-    plan: Plan, setup: Setup, abstract: PyTree, facts: dict[str, Any], folder: Path, cache: str
+    plan: Plan, setup: Setup, abstract: PyTree, facts: dict[str, Any], runs: list[Path], cache: str
 ) -> list[str]:
     """Returns every derived number of a run, as lines, before anything heavy starts."""
     left = setup.config.num_steps - plan.steps
     rounded = f", {left:,} fewer than num_steps: whole updates only" if left else ""
     device = facts["device"]
     return [
-        f"run          {folder}",
+        f"run          {runs[0]}",
+        *_seeds(runs, facts),
         f"updates      {plan.updates:,} of {plan.steps_per_update:,} steps",
         f"steps        {plan.steps:,}{rounded}",
         f"evaluations  {_ticks(plan.evaluations)}",
@@ -37,6 +38,15 @@ def describe_plan(
         f"device       {device['count']} x {device['kind']} ({device['platform']})",
         f"cache        {cache}",
     ]
+
+
+def _seeds(runs: list[Path], facts: dict[str, Any]) -> list[str]:
+    if len(runs) == 1:
+        return []
+    how = "one after another: the bits of single runs"
+    if "vmapped_seeds" in facts:
+        how = "vmapped: the statistics of single runs, other bits"
+    return [f"seeds        {len(runs)}, to {runs[-1].name}, {how}"]
 
 
 def _ticks(updates: tuple[int, ...]) -> str:

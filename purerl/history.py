@@ -40,8 +40,9 @@ class History(NamedTuple):
             return "done"
         last = self.lines[-1] if self.lines else {}
         skipped = last.get("train/skipped_in_a_row") or 0
-        # A loss that is not finite stands as null in the file.
-        lost = skipped >= MAX_SKIPPED_IN_A_ROW or last.get("train/loss", 0.0) is None
+        # What is not finite stands as null in the file.
+        null = [last.get(f"train/{name}", 0.0) is None for name in ("loss", "parameter_norm")]
+        lost = skipped >= MAX_SKIPPED_IN_A_ROW or any(null)
         return "failed" if lost else "unfinished"
 
     def curve(self, metric: str) -> dict[int, float]:

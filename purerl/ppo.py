@@ -208,6 +208,7 @@ def learn(
         "skipped_minibatches": skipped.sum(),
         "skipped_in_a_row": learner.skipped_in_a_row.astype(jnp.float32),
         "learning_rate": learner.learning_rate,
+        "parameter_norm": optax.tree.norm(learner.params),
         "explained_variance": losses.explained_variance(
             batch.old_value, batch.target, batch.weight
         ),

@@ -24,14 +24,22 @@ class Recorder:
         keep: int,
         loggers: Sequence[BackgroundLogger],
         say: Say,
+        worker: ThreadPoolExecutor | None = None,
+        together: Sequence[Path] = (),
     ) -> None:
-        """Cuts metrics.jsonl to `offset` [bytes] and clears what a crash left in checkpoints/."""
+        """Cuts metrics.jsonl to `offset` [bytes] and clears what a crash left in checkpoints/.
+
+        Seeds that train `together` (their checkpoint folders) share one `worker`: then none is
+        ever more than one checkpoint ahead of another, and all keep those they have in common.
+        """
         self.checkpoints = folder / "checkpoints"
         self.checkpoints.mkdir(exist_ok=True)
         checkpoint.clean(self.checkpoints)
         self.metrics = MetricsFile(folder / "metrics.jsonl", offset)
-        self.keep, self.loggers, self.say = keep, loggers, say
-        self.worker = ThreadPoolExecutor(1, "purerl-recorder")
+        self.keep, self.say = keep, say
+        self.loggers: list[Any] = list(loggers)  # BackgroundLogger or RunVideo
+        self.worker = worker or ThreadPoolExecutor(1, "purerl-recorder")
+        self.together = together
         self.last: Future[None] | None = None
         self.saving: Future[None] | None = None
         self.saved: int | None = None  # update of the newest checkpoint written here
@@ -101,7 +109,7 @@ class Recorder:
             meta = meta | {"digest": digest, "metrics_bytes": offset}
             checkpoint.save(self.checkpoints, leaves, meta)
             self.saved, self.digest, self.last_failed = meta["update"], digest, False
-            checkpoint.retain(self.checkpoints, self.keep)
+            checkpoint.retain(self.checkpoints, self.keep, self.together)
         except Exception as error:  # Orbax reports a full disk as any of several kinds
             what = f"The checkpoint of update {meta['update']} could not be saved"
             self._failed(f"{what}: {one_line(error)[:300]}. The newest is {self._newest()}.")

@@ -3,9 +3,11 @@
 EXPERIMENT is a name in experiments/, a path to a Python file, or a dotted module. Every setting of
 the experiment can be overridden; `python -m purerl.run EXPERIMENT --help` lists them all.
 
-The run is written to runs/<experiment>/<name>/. Killed at any moment, the same command with
---resume goes on from the last checkpoint to the same result, bit for bit. SIGTERM and Ctrl-C save
-first; a second one stops at once.
+The run is written to runs/<experiment>/<name>/; with --num-seeds S each seed has such a folder of
+its own, <name>-seed<k>, which evaluate, render and compare take like any other.
+
+Killed at any moment, the same command with --resume goes on from the last checkpoint to the same
+result, bit for bit. SIGTERM and Ctrl-C save first; a second one stops at once.
 
 Exit codes: 0 done, 1 the run cannot go on, 2 a mistake in the command, 3 stopped on request.
 """
@@ -28,10 +30,15 @@ from purerl.experiment import Experiment, Source
 
 @dataclass(frozen=True)
 class Options:
-    """How a run is kept and shown; nothing here changes what is learned."""
+    """How a run is made, kept and shown; but for vmapped seeds, nothing here changes its bits."""
 
     name: str | None = None
     """Name of the run, the folder under runs/<experiment>/ (default: seed<seed>)."""
+    num_seeds: int = 1
+    """Train this many seeds, from --seed upwards, each in a run's folder of its own."""
+    seeds_by: Literal["vmap", "map"] = "vmap"
+    """vmap: all in one program, with the statistics of single runs but other bits; map: one after
+    another, with the bits of single runs."""
     resume: bool = False
     """Go on from the last whole checkpoint of the run."""
     allow_changes: bool = False
@@ -57,9 +64,12 @@ class Options:
 
     def __post_init__(self) -> None:
         """Checks the rules."""
-        for name, least in (("log_every", 0), ("checkpoints", 0), ("keep", 1)):
+        for name, least in _LEAST.items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}.")
+
+
+_LEAST = {"num_seeds": 1, "log_every": 0, "checkpoints": 0, "keep": 1}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -96,6 +106,7 @@ def resume_command(arguments: Sequence[str]) -> str:
 def command(arguments: Sequence[str]) -> None:
     """Parses, prepares and trains."""
     from purerl.cli import parse
+    from purerl.launch import execute
 
     if arguments[0].startswith("-"):
         raise UserError(
@@ -105,10 +116,21 @@ def command(arguments: Sequence[str]) -> None:
     source = experiment.find(arguments[0])
     prog = f"python -m purerl.run {arguments[0]}"
     chosen, options = from_command_line(parse, source, arguments[1:], prog)
-    folder = options.runs / source.name / (options.name or f"seed{chosen.seed}")
     with ExitStack() as stack:
         stop = stack.enter_context(stop_signals())
-        execute(source, chosen, options, folder, stop, stack)
+        execute(source, runs_of(source, chosen, options), options, stop, stack)
+
+
+def runs_of(source: Source, chosen: Experiment, options: Options) -> dict[Path, Experiment]:
+    """Returns each seed's folder and experiment."""
+    place, last = options.runs / source.name, chosen.seed + options.num_seeds
+    if options.num_seeds == 1:
+        return {place / (options.name or f"seed{chosen.seed}"): chosen}
+    prefix = f"{options.name}-" if options.name else ""
+    return {
+        place / f"{prefix}seed{seed}": dataclasses.replace(chosen, seed=seed)
+        for seed in range(chosen.seed, last)
+    }
 
 
 def from_command_line(
@@ -154,152 +176,6 @@ def stop_signals() -> Any:
     finally:
         for number, handler in old.items():
             signal.signal(number, handler)
-
-
-def execute(
-    source: Source,
-    chosen: Experiment,
-    options: Options,
-    folder: Path,
-    stop: Callable[[], bool],
-    stack: ExitStack,
-) -> None:
-    """Prepares the folder, the programs and the first state, and trains.
-
-    Args:
-      source: where the experiment came from.
-      chosen: the experiment with its overrides.
-      options: the run's options.
-      folder: the run's.
-      stop: tells whether a signal asked to stop.
-      stack: closes what is opened here.
-    """
-    from purerl import checkpoint, console, manifest, rundir, train
-    from purerl.run_video import RunVideo
-
-    rundir.check_new_or_resume(folder, options.resume)
-    loggers = needed_loggers(options)
-    cache = set_up_jax(options.cache)
-    setup = rundir.build(chosen)
-    plan = train.make_plan(setup.config, chosen.evaluation, options.checkpoints, options.log_every)
-    schedule = {"log_every": plan.log_every, "checkpoints": options.checkpoints}
-    settings = rundir.describe(source, chosen, schedule)
-    facts = manifest.collect(setup.engine, (chosen.build_env, chosen.build_network))
-    stack.enter_context(rundir.lock(folder))
-    rundir.check_new_or_resume(folder, options.resume)  # again: another process may have been here
-    begin_or_go_on(folder, source, settings, facts, options.allow_changes)
-
-    progress = stack.enter_context(console.progress(plan.updates))
-    abstract = train.abstract_state(*setup[:3])
-    for line in console.describe_plan(plan, setup, abstract, facts, folder, cache):
-        progress.say(line)
-    saved = checkpoint.newest(folder / "checkpoints", abstract, progress.say)
-    if saved is not None and saved.meta["update"] >= plan.updates:
-        progress.say(f"Already done: {plan.updates} updates. Digest {saved.meta['digest']}")
-        return
-    programs = train.compile_programs(*setup[:3], chosen.evaluation, fresh=saved is None)
-    times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in programs.seconds.items())
-    progress.say(f"Compiled: {times}")
-    state, recorder, meta = first_state(saved, programs, chosen, options, folder, progress.say)
-    stack.callback(recorder.close)
-    recorder.loggers = [start(folder, settings, meta["update"], progress.say) for start in loggers]
-    if options.video:
-        recorder.loggers.append(RunVideo(folder, stop, progress.say))
-    meta["fingerprint"] = manifest.fingerprint(facts)
-    train.train(plan, programs, state, recorder, progress, stop, progress.say, meta)
-    progress.say(f"Done: {plan.steps:,} steps. Digest {recorder.digest}")
-
-
-def first_state(
-    saved: Any, programs: Any, chosen: Experiment, options: Options, folder: Path, say: Any
-) -> tuple[Any, Any, dict[str, Any]]:
-    """Returns the state to begin with, the recorder, and what is known of earlier lives."""
-    import jax
-
-    from purerl.recorder import Recorder
-
-    if saved is None:
-        recorder = Recorder(folder, 0, options.keep, [], say)
-        return programs.init(jax.random.key(chosen.seed)), recorder, {"wall_s": 0.0, "update": 0}
-    recorder = Recorder(folder, saved.meta["metrics_bytes"], options.keep, [], say)
-    say(f"Resuming after update {saved.meta['update']}. Digest {saved.meta['digest']}")
-    known = {name: saved.meta[name] for name in ("wall_s", "update")}
-    return saved.state, recorder, known
-
-
-def begin_or_go_on(
-    folder: Path,
-    source: Source,
-    settings: dict[str, Any],
-    facts: dict[str, Any],
-    allow_changes: bool,
-) -> None:
-    """Describes a new run on disk, or checks that this process would continue the old one."""
-    from purerl import rundir
-
-    if not (folder / "config.json").exists():
-        rundir.start(folder, source, settings, facts)
-        return
-    found = rundir.check_same(folder, source, settings, facts)
-    if found and not allow_changes:
-        pin = "device.threads"  # a CPU's bits depend on the size of XLA's thread pool
-        threads = [line.split()[1] for line in found if line.startswith(pin)]
-        found += [f"(NPROC={number} brings {pin} back)" for number in threads]
-        raise UserError(
-            f"The run {folder} was begun under other conditions, so it would not go on exactly:\n  "
-            + "\n  ".join(found)
-            + "\nGive the command it was begun with, or --allow-changes to go on all the same."
-        )
-    if found:
-        rundir.accept_changes(folder, source, settings, facts, found)
-
-
-def needed_loggers(options: Options) -> list[Callable[..., Any]]:
-    """Returns functions that start the loggers asked for; UserError if a package is missing."""
-    from purerl.loggers import (
-        BackgroundLogger,
-        TensorBoardSink,
-        WandbSink,
-        check_installed,
-    )
-
-    def tensorboard(folder: Path, settings: dict, update: int, say: Any) -> BackgroundLogger:
-        return BackgroundLogger("TensorBoard", lambda: TensorBoardSink(folder, update), say)
-
-    def wandb(folder: Path, settings: dict, update: int, say: Any) -> BackgroundLogger:
-        from purerl.rundir import read_json
-
-        name = read_json(folder / "manifest.json")["run_id"]
-        return BackgroundLogger(
-            "W&B",
-            lambda: WandbSink(folder, options.wandb, options.wandb_project, name, settings),
-            say,
-        )
-
-    starts: list[Callable[..., Any]] = []
-    if options.tensorboard:
-        check_installed("tensorboardX", "tensorboard")
-        starts.append(tensorboard)
-    if options.wandb != "off":
-        check_installed("wandb", "wandb")
-        starts.append(wandb)
-    return starts
-
-
-def set_up_jax(cache: bool) -> str:
-    """Sets what bits depend on, whatever a later JAX's defaults; returns the cache's folder."""
-    import jax
-
-    jax.config.update("jax_threefry_partitionable", True)
-    jax.config.update("jax_default_prng_impl", "threefry2x32")
-    if not cache:
-        jax.config.update("jax_enable_compilation_cache", False)
-        return "off"
-    # JAX has read JAX_COMPILATION_CACHE_DIR by now, if it is set.
-    folder = jax.config.values["jax_compilation_cache_dir"]
-    folder = folder or str(Path.home() / ".cache" / "purerl" / "jax")
-    jax.config.update("jax_compilation_cache_dir", folder)
-    return folder
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import uuid
+from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -80,15 +81,21 @@ def lock(folder: Path) -> IO[str]:
     return handle
 
 
-def check_new_or_resume(folder: Path, resume: bool) -> None:
-    """Raises UserError when the folder holds a run and should not, or the other way round."""
-    if resume and not folder.exists():
-        raise UserError(f"There is no run {folder} to resume; leave out --resume to start it.")
-    if not resume and (folder / "config.json").exists():
-        raise UserError(f"The run {folder} exists; use --resume to go on, or another --name.")
-    strange = {path.name for path in folder.iterdir()} - OURS if folder.is_dir() else set()
-    if strange and not (folder / "config.json").exists():
-        raise UserError(f"{folder} is no run (it holds {min(strange)}); use another --name.")
+def check_new_or_resume(folders: Iterable[Path], resume: bool) -> None:
+    """Raises UserError when a folder holds a run and should not, or none of them does and should.
+
+    A group of seeds that was killed while starting has the folders of some of them.
+    """
+    folders = list(folders)
+    if resume and not any(folder.exists() for folder in folders):
+        raise UserError(f"There is no run {folders[0]} to resume; leave out --resume to start it.")
+    for folder in folders:
+        is_run = (folder / "config.json").exists()
+        if is_run and not resume:
+            raise UserError(f"The run {folder} exists; use --resume to go on, or another --name.")
+        strange = {path.name for path in folder.iterdir()} - OURS if folder.is_dir() else set()
+        if strange and not is_run:
+            raise UserError(f"{folder} is no run (it holds {min(strange)}); use another --name.")
 
 
 def describe(source: Source, chosen: Experiment, schedule: dict[str, Any]) -> dict[str, Any]:

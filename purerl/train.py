@@ -9,7 +9,7 @@ evaluation and checkpoints cannot change a bit.
 import functools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -72,7 +72,7 @@ def evenly(number: int, updates: int, every: int) -> tuple[int, ...]:
 
 
 class Programs(NamedTuple):
-    """A run's compiled functions."""
+    """A run's compiled functions; of S vmapped seeds every array has a leading axis [S]."""
 
     init: Callable[[Array], TrainState]
     update: Callable[[TrainState], tuple[TrainState, Metrics]]
@@ -86,22 +86,36 @@ def abstract_state(config: Config, env: Env, network: Network) -> PyTree:
 
 
 def compile_programs(
-    config: Config, env: Env, network: Network, evaluation: Evaluation, fresh: bool
+    config: Config,
+    env: Env,
+    network: Network,
+    evaluation: Evaluation,
+    fresh: bool,
+    vmapped_seeds: int = 1,
 ) -> Programs:
     """Compiles what a run calls; `init` only for a fresh one, `evaluate` only if planned."""
-    seconds: dict[str, float] = {}
-    abstract = abstract_state(config, env, network)
     # Initialisation is one program too: computed eagerly, its bits are others.
-    init = jax.jit(functools.partial(ppo.init, config, env, network))
-    update = jax.jit(functools.partial(ppo.update, config, env, network), donate_argnums=0)
-    judge = jax.jit(functools.partial(evaluate_in_run, config, env, network, evaluation))
+    init = functools.partial(ppo.init, config, env, network)
+    update = functools.partial(ppo.update, config, env, network)
+    judge = functools.partial(evaluate_in_run, config, env, network, evaluation)
     key = jax.random.key(0)
+    if vmapped_seeds > 1:
+        init, update, judge = jax.vmap(init), jax.vmap(update), jax.vmap(judge)
+        key = jax.random.split(key, vmapped_seeds)
+    abstract = jax.eval_shape(init, key)
+    seconds: dict[str, float] = {}
+    compile_init = _compile if fresh else _compile_later
+    compile_judge = _compile if evaluation.number else _compile_later
     return Programs(
-        init=_compile("init", init, key, seconds) if fresh else init,
-        update=_compile("update", update, abstract, seconds),
-        evaluate=_compile("evaluation", judge, abstract, seconds) if evaluation.number else judge,
+        init=compile_init("init", jax.jit(init), key, seconds),
+        update=_compile("update", jax.jit(update, donate_argnums=0), abstract, seconds),
+        evaluate=compile_judge("evaluation", jax.jit(judge), abstract, seconds),
         seconds=seconds,
     )
+
+
+def _compile_later(name: str, function: Any, argument: PyTree, seconds: dict[str, float]) -> Any:
+    return function
 
 
 def _compile(name: str, function: Any, argument: PyTree, seconds: dict[str, float]) -> Any:
@@ -142,7 +156,7 @@ def train(
     plan: Plan,
     programs: Programs,
     state: TrainState,
-    recorder: Recorder,
+    recorders: Sequence[Recorder],
     progress: Progress,
     stop: Callable[[], bool],
     say: Say,
@@ -154,17 +168,19 @@ def train(
       plan: what to do when.
       programs: the compiled functions.
       state: where to begin; it is consumed.
-      recorder: what writes metrics and checkpoints.
+      recorders: what writes metrics and checkpoints, one for each vmapped seed.
       progress: told of every chunk.
       stop: asked between chunks whether to save and stop.
       say: prints a line.
-      meta: what every checkpoint says; "wall_s" is the time that earlier lives of the run took.
+      meta: what every checkpoint says; "update" is where `state` is, "wall_s" the time that
+        earlier lives of the run took.
 
     Raises:
       StoppedError: stopped on request, saved.
       RunError: the numbers are no longer finite, or the last checkpoint could not be saved.
     """
-    first = update = safe = int(state.update)  # safe: a kill after this update loses nothing
+    number = len(recorders)
+    first = update = safe = meta["update"]  # safe: a kill after this update loses nothing
     begin = time.perf_counter()
     while update < plan.updates:
         if stop() and safe == update:
@@ -173,23 +189,38 @@ def train(
         state, window = advance(programs, state, end - update)
         update = end
         seconds = time.perf_counter() - begin
-        record = make_record(state, update, meta["wall_s"] + seconds, window)
-        check_skipped(record, recorder)
+        records = make_records(state, update, meta["wall_s"] + seconds, window, number)
+        check_finite(state, records, recorders)
         if update in plan.evaluations:
-            judged = summarize_evaluation(jax.device_get(programs.evaluate(state)))
-            record |= {f"eval/{name}": value for name, value in judged.items()}
-            say(describe_evaluation(record, plan))
+            judged = each_seed(jax.device_get(programs.evaluate(state)), number)
+            for record, metrics in zip(records, judged, strict=True):
+                found = summarize_evaluation(metrics)
+                record |= {f"eval/{name}": value for name, value in found.items()}
+            say(describe_evaluation(records, plan))
         planned = update in plan.checkpoints
         if planned or stop():
-            _save(state, record, recorder, meta, planned)
+            _save(state, records, recorders, meta, planned)
             safe = update
         else:
-            recorder.write(record)
+            for recorder, record in zip(recorders, records, strict=True):
+                recorder.write(record)
         rate = (update - first) / (time.perf_counter() - begin)
-        progress.show(record, (plan.updates - update) / rate, rate * plan.steps_per_update)
-    recorder.finish()
+        left = (plan.updates - update) / rate
+        progress.show(shown_record(records), left, rate * plan.steps_per_update * number)
+    for recorder in recorders:
+        recorder.finish()
     if update < plan.updates:
         raise StoppedError(f"Stopped after update {update} of {plan.updates}; it is saved.")
+
+
+def each_seed(tree: PyTree, number: int) -> list[PyTree]:
+    """Cuts host arrays [S, ...] into those of each seed; of a single run they are its own."""
+    if number == 1:
+        return [tree]
+    leaves, structure = jax.tree.flatten(tree)
+    return [
+        jax.tree.unflatten(structure, [np.array(leaf[i]) for leaf in leaves]) for i in range(number)
+    ]
 
 
 def advance(programs: Programs, state: TrainState, number: int) -> tuple[TrainState, list[Any]]:
@@ -201,56 +232,91 @@ def advance(programs: Programs, state: TrainState, number: int) -> tuple[TrainSt
     return state, jax.device_get(window)
 
 
-def make_record(state: TrainState, update: int, wall_s: float, window: list[Any]) -> Record:
-    """Returns a chunk's line of metrics.jsonl."""
-    steps = count_as_int(jax.device_get(state.steps))
-    trained = {f"train/{name}": value for name, value in summarize(window).items()}
-    return {"update": update, "steps": steps, "wall_s": round(wall_s, 3)} | trained
+def make_records(
+    state: TrainState, update: int, wall_s: float, window: list[Any], number: int
+) -> list[Record]:
+    """Returns a chunk's line of metrics.jsonl for each seed."""
+    steps = each_seed(jax.device_get(state.steps), number)
+    windows = zip(*(each_seed(metrics, number) for metrics in window), strict=True)
+    return [
+        {"update": update, "steps": count_as_int(count), "wall_s": round(wall_s, 3)}
+        | {f"train/{name}": value for name, value in summarize(metrics).items()}
+        for count, metrics in zip(steps, windows, strict=True)
+    ]
 
 
-def check_skipped(record: Record, recorder: Recorder) -> None:
-    """Raises RunError when every minibatch of late was non-finite and had to be skipped."""
-    skipped = record["train/skipped_in_a_row"]
-    if skipped >= MAX_SKIPPED_IN_A_ROW:
-        _give_up(
-            record, recorder,
-            f"The last {skipped:.0f} minibatches had a non-finite loss or gradient and were "
-            "skipped. Lower ppo.learning_rate or ppo.reward_scale, or mend the environment's "
-            "reward."
-        )  # fmt: skip
+def shown_record(records: Sequence[Record]) -> Record:
+    """Returns what progress shows: a run's own line, of many seeds with their mean return."""
+    returns = [r["train/episode_return"] for r in records]
+    known = [value for value in returns if value is not None]
+    return records[0] | {"train/episode_return": sum(known) / len(known) if known else None}
+
+
+def check_finite(
+    state: TrainState, records: Sequence[Record], recorders: Sequence[Recorder]
+) -> None:
+    """Raises RunError when parameters are not finite, or every minibatch of late was skipped.
+
+    Vmapped seeds stop together: they resume together, and a seed that is lost cannot be saved.
+    """
+    for i, record in enumerate(records):
+        if not math.isfinite(record["train/parameter_norm"]):
+            params = each_seed(checkpoint.flatten(state.params), len(records))[i]
+            bad = [k for k, x in params.items() if not np.isfinite(x.astype(np.float64)).all()]
+            reason = f"Parameters are not finite: {', '.join(bad) or 'their norm overflows'}. "
+            _give_up(i, records, recorders, reason + "Lower ppo.learning_rate.")
+        skipped = record["train/skipped_in_a_row"]
+        if skipped >= MAX_SKIPPED_IN_A_ROW:
+            reason = (
+                f"The last {skipped:.0f} minibatches had a non-finite loss or gradient and were "
+                "skipped. Lower ppo.learning_rate or ppo.reward_scale, or mend the environment's "
+                "reward."
+            )
+            _give_up(i, records, recorders, reason)
 
 
 def _save(
-    state: TrainState, record: Record, recorder: Recorder, meta: Record, planned: bool
+    state: TrainState,
+    records: Sequence[Record],
+    recorders: Sequence[Recorder],
+    meta: Record,
+    planned: bool,
 ) -> None:
-    leaves = checkpoint.flatten(state)
-    learned = {path: x for path, x in leaves.items() if path.split("/")[0] == "params"}
-    bad = [path for path, x in learned.items() if not np.isfinite(x.astype(np.float64)).all()]
-    if bad:
-        _give_up(record, recorder, f"Parameters are not finite: {', '.join(bad)}.")
-    score = record.get("eval/episode_return")
-    meta = meta | {
-        "update": record["update"],
-        "steps": record["steps"],
-        "wall_s": record["wall_s"],
-        "eval_return": score if score is not None and math.isfinite(score) else None,
-    }
-    recorder.save(record, leaves, meta, planned)
+    parts = each_seed(checkpoint.flatten(state), len(records))
+    for leaves, record, recorder in zip(parts, records, recorders, strict=True):
+        score = record.get("eval/episode_return")
+        about = meta | {name: record[name] for name in ("update", "steps", "wall_s")}
+        about["eval_return"] = score if score is not None and math.isfinite(score) else None
+        recorder.save(record, leaves, about, planned)
 
 
-def _give_up(record: Record, recorder: Recorder, reason: str) -> None:
-    """Ends the run with an error; its metrics are kept, its state is not."""
-    recorder.write(record)
-    recorder.close()
-    found = checkpoint.updates(recorder.checkpoints)
-    kept = recorder.checkpoints / f"{found[-1]:012d}" if found else "none"
-    raise RunError(f"Update {record['update']}: {reason} The last good checkpoint is {kept}.")
+def _give_up(
+    lost: int, records: Sequence[Record], recorders: Sequence[Recorder], reason: str
+) -> None:
+    """Ends the run with an error about seed number `lost`; metrics are kept, the state is not."""
+    for recorder, record in zip(recorders, records, strict=True):
+        recorder.write(record)
+    for recorder in recorders:
+        recorder.close()
+    folder = recorders[lost].checkpoints
+    found = checkpoint.updates(folder)
+    kept = folder / f"{found[-1]:012d}" if found else "none"
+    raise RunError(
+        f"Update {records[lost]['update']} of {folder.parent}: {reason} The last good checkpoint "
+        f"is {kept}."
+    )
 
 
-def describe_evaluation(record: Record, plan: Plan) -> str:
-    """Returns an evaluation as one line for a person."""
+def describe_evaluation(records: Sequence[Record], plan: Plan) -> str:
+    """Returns an evaluation as one line for a person; of many seeds the mean over them."""
+    mean = {name: np.mean([record[name] for record in records]) for name in records[0]
+            if name.startswith("eval/")}  # fmt: skip
+    spread, over = mean["eval/episode_return_std"], ""
+    if len(records) > 1:
+        spread = np.std([record["eval/episode_return"] for record in records])
+        over = f" over {len(records)} seeds"
     return (
-        f"update {record['update']}/{plan.updates}  steps {record['steps']:,}  evaluation: return "
-        f"{record['eval/episode_return']:.2f} +- {record['eval/episode_return_std']:.2f}, "
-        f"episode length {record['eval/episode_length']:.0f}"
+        f"update {records[0]['update']}/{plan.updates}  steps {records[0]['steps']:,}  evaluation: "
+        f"return {mean['eval/episode_return']:.2f} +- {spread:.2f}{over}, "
+        f"episode length {mean['eval/episode_length']:.0f}"
     )

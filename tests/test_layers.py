@@ -18,6 +18,7 @@ EFFECTS = {
     "experiment",
     "groups",
     "history",
+    "launch",
     "loggers",
     "manifest",
     "recorder",

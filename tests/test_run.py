@@ -8,7 +8,6 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from purerl import checkpoint, recorder, run, train
@@ -222,23 +221,36 @@ def test_a_last_checkpoint_that_fails_is_an_error(tmp_path, monkeypatch, capsys)
     assert "The last checkpoint could not be saved" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("fault", ["skipped", "parameters"])
-def test_non_finite_learning_stops_and_is_never_saved(tmp_path, monkeypatch, capsys, fault):
-    advance = train.advance
-
-    def broken(programs, state, number):
-        state, window = advance(programs, state, number)
-        if int(state.update) >= 6 and fault == "skipped":
-            window[-1] = window[-1] | {"skipped_in_a_row": np.float32(10)}
-        if int(state.update) == 6 and fault == "parameters":
-            state = state.replace(params=train.jax.tree.map(lambda x: x * np.nan, state.params))
-        return state, window
-
-    monkeypatch.setattr(train, "advance", broken)
-    assert start(tmp_path, "--checkpoints", "4") == FAILURE
+@pytest.mark.parametrize(
+    ("words", "reason", "update"),
+    [
+        (["--ppo.reward-scale", "1e38"], "minibatches had a non-finite loss", 11),
+        (
+            ["--ppo.learning-rate", "1e38", "--ppo.schedule", "linear"],
+            "Parameters are not finite",
+            7,
+        ),
+    ],
+)
+@pytest.mark.parametrize("every", [1, 12])
+def test_non_finite_learning_stops_and_is_never_saved(
+    tmp_path, stop_after, capsys, words, reason, update, every
+):
+    stop_after(10)
+    start(tmp_path, "--checkpoints", "4")
+    assert checkpoints(tmp_path) == [3, 6]
+    stop_after(10**9)
+    words = [*words, "--log-every", str(every), "--checkpoints", "12", "--resume"]
+    assert start(tmp_path, *words, "--allow-changes", "--keep", "9") == FAILURE
     said = capsys.readouterr().err
-    assert "Update 6" in said and f"{3:012d}" in said and "Traceback" not in said
-    assert checkpoints(tmp_path) == [3]
+    # 2 minibatches in an update; with a chunk of 12 updates it is noticed at the end.
+    update = update if every == 1 else 12
+    assert f"Update {update} of {folder(tmp_path)}: " in said and reason in said, said
+    sound = [3, 6, *(range(7, update) if every == 1 else ())]
+    assert checkpoints(tmp_path) == sound
+    assert f"The last good checkpoint is {folder(tmp_path)}" in said
+    assert f"{sound[-1]:012d}" in said and "Traceback" not in said
+    assert lines(tmp_path)[-1]["update"] == update
 
 
 def test_a_failing_logger_does_not_stop_training(whole, tmp_path, monkeypatch, capsys):

@@ -1,0 +1,217 @@
+"""Carries a run command out: prepares folders and programs, and trains one seed or several.
+
+A seed's folder is a run like any other. Seeds mapped one after another are runs one after another,
+with the same compiled programs: their bits are those of single runs by construction. Vmapped seeds
+share one program, whose bits depend on their number; they are saved and resumed together, always at
+an update that all of them have on the disk.
+"""
+
+import functools
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+
+from purerl import checkpoint, console, manifest, rundir, train
+from purerl.errors import RunError, UserError
+from purerl.experiment import Experiment, Source
+from purerl.loggers import BackgroundLogger, Say, TensorBoardSink, WandbSink, check_installed
+from purerl.recorder import Recorder
+from purerl.run_video import RunVideo
+from purerl.types import PyTree, TrainState
+
+if TYPE_CHECKING:
+    from purerl.run import Options
+
+
+def execute(
+    source: Source,
+    runs: dict[Path, Experiment],
+    options: "Options",
+    stop: Callable[[], bool],
+    stack: ExitStack,
+) -> None:
+    """Prepares the folders and the programs, and trains.
+
+    Args:
+      source: where the experiment came from.
+      runs: each seed's folder, and the experiment with its overrides.
+      options: the run's options.
+      stop: tells whether a signal asked to stop.
+      stack: closes what is opened here.
+    """
+    chosen, vmapped = next(iter(runs.values())), vmapped_seeds(options)
+    rundir.check_new_or_resume(runs, options.resume)
+    loggers = needed_loggers(options)
+    cache = set_up_jax(options.cache)
+    setup = rundir.build(chosen)
+    plan = train.make_plan(setup.config, chosen.evaluation, options.checkpoints, options.log_every)
+    schedule = {"log_every": plan.log_every, "checkpoints": options.checkpoints}
+    facts = manifest.collect(setup.engine, (chosen.build_env, chosen.build_network))
+    if vmapped > 1:  # part of what the bits depend on
+        facts["vmapped_seeds"] = {"first": chosen.seed, "number": vmapped}
+    for folder in runs:
+        stack.enter_context(rundir.lock(folder))
+    rundir.check_new_or_resume(runs, options.resume)  # again: another process may have been here
+    for folder, one in runs.items():
+        settings = rundir.describe(source, one, schedule)
+        begin_or_go_on(folder, source, settings, facts, options.allow_changes)
+    abstract = train.abstract_state(*setup[:3])
+    lines = console.describe_plan(plan, setup, abstract, facts, list(runs), cache)
+    print("\n".join(lines), flush=True)
+
+    fresh = not all(any((folder / "checkpoints").glob("*")) for folder in runs)
+    programs = functools.cache(
+        lambda: train.compile_programs(*setup[:3], chosen.evaluation, fresh, vmapped)
+    )
+    groups = [list(runs)] if vmapped > 1 else [[folder] for folder in runs]
+    failed = []
+    for folders in groups:
+        seeds = [runs[folder].seed for folder in folders]
+        try:
+            train_together(folders, seeds, plan, programs, abstract, facts, options, loggers, stop)
+        except RunError as error:  # the seeds after it can still be trained
+            failed.append(str(error))
+    if failed:
+        raise RunError(" ".join(failed))
+
+
+def vmapped_seeds(options: "Options") -> int:
+    """Returns how many seeds share one program; 1 if each is trained by itself."""
+    return options.num_seeds if options.seeds_by == "vmap" else 1
+
+
+def train_together(
+    folders: list[Path],
+    seeds: list[int],
+    plan: train.Plan,
+    programs: Callable[[], train.Programs],
+    abstract: PyTree,
+    facts: dict[str, Any],
+    options: "Options",
+    loggers: list[Callable[..., BackgroundLogger]],
+    stop: Callable[[], bool],
+) -> None:
+    """Trains one run, or vmapped ones, from the newest checkpoint that all of them have."""
+    with console.progress(plan.updates) as progress, ExitStack() as stack:
+        places = [folder / "checkpoints" for folder in folders]
+        saved = checkpoint.newest_of_all(places, abstract, progress.say)
+        if saved and saved[0].meta["update"] >= plan.updates:
+            for one in saved:
+                progress.say(f"Already done: {plan.updates} updates. Digest {one.meta['digest']}")
+            return
+        seconds = programs().seconds
+        times = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items())
+        progress.say(f"Compiled: {times}")
+        state, meta = first_state(saved, seeds, programs(), progress.say)
+        recorders = open_recorders(folders, saved, options, progress.say)
+        for folder, recorder in zip(folders, recorders, strict=True):
+            stack.callback(recorder.close)
+            recorder.loggers = [start(folder, meta["update"], progress.say) for start in loggers]
+        if options.video:  # of the first seed: one such process is enough
+            recorders[0].loggers.append(RunVideo(folders[0], stop, progress.say))
+        meta["fingerprint"] = manifest.fingerprint(facts)
+        train.train(plan, programs(), state, recorders, progress, stop, progress.say, meta)
+        for folder, recorder in zip(folders, recorders, strict=True):
+            of = f" of {folder.name}" if options.num_seeds > 1 else ""
+            progress.say(f"Done: {plan.steps:,} steps{of}. Digest {recorder.digest}")
+
+
+def first_state(
+    saved: list[checkpoint.Saved], seeds: list[int], programs: train.Programs, say: Say
+) -> tuple[TrainState, dict[str, Any]]:
+    """Returns the state to begin with, and what is known of earlier lives."""
+
+    def together(trees: list[Any]) -> Any:
+        return trees[0] if len(trees) == 1 else jax.tree.map(lambda *x: jnp.stack(x), *trees)
+
+    if not saved:
+        keys = together([jax.random.key(seed) for seed in seeds])
+        return programs.init(keys), {"wall_s": 0.0, "update": 0}
+    for one in saved:
+        say(f"Resuming after update {one.meta['update']}. Digest {one.meta['digest']}")
+    known = {name: saved[0].meta[name] for name in ("wall_s", "update")}
+    return together([one.state for one in saved]), known
+
+
+def open_recorders(
+    folders: list[Path], saved: list[checkpoint.Saved], options: "Options", say: Say
+) -> list[Recorder]:
+    """Opens what writes each seed's folder, cut back to the checkpoints `saved`."""
+    worker = ThreadPoolExecutor(1, "purerl-recorder")
+    together = [folder / "checkpoints" for folder in folders]
+    for place in together:
+        checkpoint.forget_after(place, saved[0].meta["update"] if saved else 0)
+    offsets = [one.meta["metrics_bytes"] for one in saved] or [0] * len(folders)
+    return [
+        Recorder(folder, offset, options.keep, [], say, worker, together)
+        for folder, offset in zip(folders, offsets, strict=True)
+    ]
+
+
+def begin_or_go_on(
+    folder: Path,
+    source: Source,
+    settings: dict[str, Any],
+    facts: dict[str, Any],
+    allow_changes: bool,
+) -> None:
+    """Describes a new run on disk, or checks that this process would continue the old one."""
+    if not (folder / "config.json").exists():
+        rundir.start(folder, source, settings, facts)
+        return
+    found = rundir.check_same(folder, source, settings, facts)
+    if found and not allow_changes:
+        pin = "device.threads"  # a CPU's bits depend on the size of XLA's thread pool
+        threads = [line.split()[1] for line in found if line.startswith(pin)]
+        found += [f"(NPROC={number} brings {pin} back)" for number in threads]
+        raise UserError(
+            f"The run {folder} was begun under other conditions, so it would not go on exactly:\n  "
+            + "\n  ".join(found)
+            + "\nGive the command it was begun with, or --allow-changes to go on all the same."
+        )
+    if found:
+        rundir.accept_changes(folder, source, settings, facts, found)
+
+
+def needed_loggers(options: "Options") -> list[Callable[..., Any]]:
+    """Returns functions that start the loggers asked for; UserError if a package is missing."""
+
+    def tensorboard(folder: Path, update: int, say: Any) -> BackgroundLogger:
+        return BackgroundLogger("TensorBoard", lambda: TensorBoardSink(folder, update), say)
+
+    def wandb(folder: Path, update: int, say: Any) -> BackgroundLogger:
+        name = rundir.read_json(folder / "manifest.json")["run_id"]
+        settings = rundir.read_json(folder / "config.json")
+        return BackgroundLogger(
+            "W&B",
+            lambda: WandbSink(folder, options.wandb, options.wandb_project, name, settings),
+            say,
+        )
+
+    starts: list[Callable[..., Any]] = []
+    if options.tensorboard:
+        check_installed("tensorboardX", "tensorboard")
+        starts.append(tensorboard)
+    if options.wandb != "off":
+        check_installed("wandb", "wandb")
+        starts.append(wandb)
+    return starts
+
+
+def set_up_jax(cache: bool) -> str:
+    """Sets what bits depend on, whatever a later JAX's defaults; returns the cache's folder."""
+    jax.config.update("jax_threefry_partitionable", True)
+    jax.config.update("jax_default_prng_impl", "threefry2x32")
+    if not cache:
+        jax.config.update("jax_enable_compilation_cache", False)
+        return "off"
+    # JAX has read JAX_COMPILATION_CACHE_DIR by now, if it is set.
+    folder = jax.config.values["jax_compilation_cache_dir"]
+    folder = folder or str(Path.home() / ".cache" / "purerl" / "jax")
+    jax.config.update("jax_compilation_cache_dir", folder)
+    return folder
