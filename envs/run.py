@@ -115,7 +115,9 @@ class Run:
         model, noise = self.physics.model, self.options.reset_noise
         limbs = jax.random.uniform(limbs_key, (len(self.joints),), minval=-noise, maxval=noise)
         qvel = jax.random.uniform(velocity_key, (model.nv,), minval=-noise, maxval=noise)
-        qpos = jnp.asarray(model.qpos0, jnp.float32).at[jnp.array(self.joints)].add(limbs)
+        rest = jnp.asarray(model.qpos0, jnp.float32)
+        # Unique: a sum of terms that might meet would have no fixed order on a GPU.
+        qpos = rest.at[jnp.array(self.joints)].add(limbs, unique_indices=True)
         task = {"factors": draw_factors(model_key, self.options.randomization)}
         if isinstance(self.parts.arena, GapsCorridor):
             task["course"] = draw_course(course_key, self.parts.arena)

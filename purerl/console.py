@@ -37,7 +37,12 @@ def describe_plan(
         f"engine       {setup.engine}",
         f"device       {device['count']} x {device['kind']} ({device['platform']})",
         f"cache        {cache}",
+        f"bit-exact    {_exactness(facts)}",
     ]
+
+
+def _exactness(facts: dict[str, Any]) -> str:
+    return "yes" if facts["bit_exact"] else f"no: {'; '.join(facts['inexact_because'])}"
 
 
 def _seeds(runs: list[Path], facts: dict[str, Any]) -> list[str]:

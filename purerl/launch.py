@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from purerl import checkpoint, console, manifest, rundir, train
+from purerl import checkpoint, console, kernels, manifest, rundir, train
 from purerl.errors import RunError, UserError
 from purerl.experiment import Experiment, Source
 from purerl.loggers import BackgroundLogger, Say, TensorBoardSink, WandbSink, check_installed
@@ -51,7 +51,9 @@ def execute(
     setup = rundir.build(chosen)
     plan = train.make_plan(setup.config, chosen.evaluation, options.checkpoints, options.log_every)
     schedule = {"log_every": plan.log_every, "checkpoints": options.checkpoints}
-    facts = manifest.collect(setup.engine, (chosen.build_env, chosen.build_network))
+    platform = jax.default_backend()
+    chosen_by = kernels.how_chosen(platform, options.cache)
+    facts = manifest.collect(setup.engine, (chosen.build_env, chosen.build_network), chosen_by)
     if vmapped > 1:  # part of what the bits depend on
         facts["vmapped_seeds"] = {"first": chosen.seed, "number": vmapped}
     for folder in runs:
@@ -65,9 +67,20 @@ def execute(
     print("\n".join(lines), flush=True)
 
     fresh = not all(any((folder / "checkpoints").glob("*")) for folder in runs)
-    programs = functools.cache(
-        lambda: train.compile_programs(*setup[:3], chosen.evaluation, fresh, vmapped)
-    )
+
+    @functools.cache
+    def programs() -> train.Programs:
+        if platform == "gpu" and options.cache:
+            for folder in runs:
+                kernels.bring(folder, cache)
+        made = train.compile_programs(*setup[:3], chosen.evaluation, fresh, vmapped)
+        if platform == "gpu":
+            reasons = manifest.inexact_because(setup.engine, chosen_by, made.unordered)
+            for folder in runs:
+                rundir.amend(folder, manifest.exactness(reasons))
+                kernels.keep(folder, cache)
+        return made
+
     groups = [list(runs)] if vmapped > 1 else [[folder] for folder in runs]
     failed = []
     for folders in groups:

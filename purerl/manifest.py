@@ -19,16 +19,18 @@ from typing import Any
 
 PACKAGES = ["jax", "jaxlib", "mujoco", "mujoco-mjx", "dm-control", "flax", "optax", "numpy"]
 PACKAGES += ["orbax-checkpoint"]
-INFORMATIVE = ("run_id", "git_revision", "git_dirty", "allowed_changes")
+INFORMATIVE = {"run_id", "git_revision", "git_dirty", "allowed_changes"}
+INFORMATIVE |= {"bit_exact", "inexact_because"}  # what they follow from is compared itself
 FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE", "JAX_PLATFORMS", "JAX_ENABLE_X64")
 
 
-def collect(engine: str, builders: Iterable[Callable]) -> dict[str, Any]:
+def collect(engine: str, builders: Iterable[Callable], kernels: str = "fixed") -> dict[str, Any]:
     """Describes this process: all that decides a run's bits apart from the run's own settings.
 
     Args:
       engine: the physics engine in use, resolved ("auto" is not an answer).
       builders: functions whose source folders are part of the run (build_env, build_network).
+      kernels: `kernels.how_chosen`.
     """
     import jax
 
@@ -41,17 +43,46 @@ def collect(engine: str, builders: Iterable[Callable]) -> dict[str, Any]:
     if device.platform == "cpu":  # XLA's pool size changes the bits of matrix products on a CPU
         about["threads"] = cpu_threads()
     options = jax.config.values
-    return {
-        "versions": {"python": platform.python_version()} | {p: _version(p) for p in PACKAGES},
-        "device": about,
-        "engine": engine,
-        "matmul_precision": options["jax_default_matmul_precision"] or "default",
-        "x64": options["jax_enable_x64"],
-        "prng": options["jax_default_prng_impl"],
-        "threefry_partitionable": options["jax_threefry_partitionable"],
-        "flags": {name: os.environ[name] for name in FLAGS if name in os.environ},
-        "source": source_hash(builders),
-    } | _git(Path(__file__).parent)
+    return (
+        {
+            "versions": {"python": platform.python_version()} | {p: _version(p) for p in PACKAGES},
+            "device": about,
+            "engine": engine,
+            "kernels": kernels,
+            "matmul_precision": options["jax_default_matmul_precision"] or "default",
+            "x64": options["jax_enable_x64"],
+            "prng": options["jax_default_prng_impl"],
+            "threefry_partitionable": options["jax_threefry_partitionable"],
+            "flags": {name: os.environ[name] for name in FLAGS if name in os.environ},
+            "source": source_hash(builders),
+        }
+        | exactness(inexact_because(engine, kernels))
+        | _git(Path(__file__).parent)
+    )
+
+
+def inexact_because(engine: str, kernels: str, unordered: Iterable[str] = ()) -> list[str]:
+    """Lists what keeps two runs of one manifest from having the same bits; empty: nothing does.
+
+    Args:
+      engine: the physics engine.
+      kernels: `kernels.how_chosen`.
+      unordered: places of sums, in a program for a GPU, whose order nothing fixes.
+    """
+    reasons = [f"a sum without a fixed order: {place}" for place in unordered]
+    if engine == "warp":
+        reasons.append("engine warp: MJX-Warp adds with atomics, in any order")
+    if kernels == "anew in each process":
+        reasons.append(
+            "XLA times the kernels it chooses from anew in each process: leave out --no-cache, or "
+            "set XLA_FLAGS=--xla_gpu_autotune_level=0"
+        )
+    return reasons
+
+
+def exactness(reasons: list[str]) -> dict[str, Any]:
+    """Returns what manifest.json says of a run's exactness."""
+    return {"bit_exact": not reasons, "inexact_because": reasons}
 
 
 def cpu_threads() -> int:

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-from purerl import checkpoint, experiment, manifest, train
+from purerl import checkpoint, experiment, kernels, manifest, train
 from purerl.config import Config
 from purerl.env import Env
 from purerl.errors import UserError, one_line
@@ -19,6 +19,7 @@ from purerl.types import Network
 
 LOCK = ".lock"
 OURS = {LOCK, "config.json", "manifest.json", "experiment.py", "metrics.jsonl", "checkpoints"}
+OURS |= {kernels.KEPT}
 
 
 class Setup(NamedTuple):
@@ -136,6 +137,12 @@ def accept_changes(
     shutil.copyfile(source.path, folder / "experiment.py")
     write_json(folder / "manifest.json", facts | kept)
     write_json(folder / "config.json", settings)
+
+
+def amend(folder: Path, facts: dict[str, Any]) -> None:
+    """Adds to manifest.json what is known only when the programs are compiled."""
+    path = folder / "manifest.json"
+    write_json(path, read_json(path) | facts)
 
 
 def restore(folder: Path, update: str, say: Say, engine: str = "") -> Run:

@@ -17,6 +17,7 @@ import numpy as np
 
 from purerl import checkpoint, ppo
 from purerl.config import Config
+from purerl.deterministic import list_scatter_sums
 from purerl.env import Env
 from purerl.errors import RunError, StoppedError
 from purerl.evaluation import evaluate
@@ -78,6 +79,7 @@ class Programs(NamedTuple):
     update: Callable[[TrainState], tuple[TrainState, Metrics]]
     evaluate: Callable[[TrainState], Metrics]
     seconds: dict[str, float]  # that compiling each took
+    unordered: list[str]  # sums of the update whose order nothing fixes on a GPU
 
 
 def abstract_state(config: Config, env: Env, network: Network) -> PyTree:
@@ -104,13 +106,18 @@ def compile_programs(
         key = jax.random.split(key, vmapped_seeds)
     abstract = jax.eval_shape(init, key)
     seconds: dict[str, float] = {}
+    start = time.perf_counter()
+    traced = jax.jit(update, donate_argnums=0).trace(abstract)
+    compiled = traced.lower().compile()
+    seconds["update"] = time.perf_counter() - start
     compile_init = _compile if fresh else _compile_later
     compile_judge = _compile if evaluation.number else _compile_later
     return Programs(
         init=compile_init("init", jax.jit(init), key, seconds),
-        update=_compile("update", jax.jit(update, donate_argnums=0), abstract, seconds),
+        update=compiled,
         evaluate=compile_judge("evaluation", jax.jit(judge), abstract, seconds),
         seconds=seconds,
+        unordered=sorted({f"{s.primitive} at {s.source}" for s in list_scatter_sums(traced.jaxpr)}),
     )
 
 

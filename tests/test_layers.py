@@ -18,6 +18,7 @@ EFFECTS = {
     "experiment",
     "groups",
     "history",
+    "kernels",
     "launch",
     "loggers",
     "manifest",

@@ -1,6 +1,17 @@
 """What a run depends on is written down, and told apart from what it does not depend on."""
 
-from purerl import manifest
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from purerl import kernels, manifest, ppo, train
+from purerl.deterministic import list_scatter_sums
+from purerl.experiment import Evaluation, load
+from purerl.rundir import build
+from tests.test_run import ROOT, TOY
 
 
 def test_differences_are_named_by_path():
@@ -48,3 +59,57 @@ def test_an_edit_changes_the_source_hash(tmp_path, monkeypatch):
     assert manifest.source_hash([task.build]) == before
     (package / "body.py").write_text("LEGS = 6\n")
     assert manifest.source_hash([task.build]) != before
+
+
+def test_a_manifest_says_whether_the_run_is_exact_and_what_prevents_it(monkeypatch):
+    assert manifest.collect("c", [])["bit_exact"] is True
+    warp = manifest.collect("warp", [])
+    assert warp["bit_exact"] is False and "warp" in warp["inexact_because"][0]
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    assert kernels.how_chosen("cpu", False) == "fixed"
+    assert kernels.how_chosen("gpu", True) == "kept with the run"
+    timed = kernels.how_chosen("gpu", False)
+    assert "--no-cache" in manifest.collect("jax", [], timed)["inexact_because"][0]
+    monkeypatch.setenv("XLA_FLAGS", "--xla_a=b --xla_gpu_autotune_level=0")
+    assert kernels.how_chosen("gpu", False) == "fixed"
+
+
+def test_chosen_kernels_go_with_the_run(tmp_path):
+    run, cache, other = tmp_path / "run", tmp_path / "cache", tmp_path / "other"
+    (cache / kernels.CHOICES).mkdir(parents=True)
+    (cache / kernels.CHOICES / "a.textproto").write_text("first")
+    kernels.keep(run, str(cache))
+    (cache / kernels.CHOICES / "a.textproto").write_text("later")
+    kernels.keep(run, str(cache))
+    kernels.bring(run, str(other))
+    assert (other / kernels.CHOICES / "a.textproto").read_text() == "first"
+    assert len(list(other.rglob("*.*proto*"))) == 1
+    kernels.bring(tmp_path / "no run", str(other))
+
+
+@pytest.mark.parametrize("name", ["cartpole_swingup", "ant_run"])
+def test_no_update_has_a_sum_without_a_fixed_order(name):
+    source = load(ROOT / "experiments" / f"{name}.py").experiment
+    config, env, network, _ = build(dataclasses.replace(source, engine="jax"))
+    update = functools.partial(ppo.update, config, env, network)
+    trace = jax.make_jaxpr(update)(train.abstract_state(config, env, network))
+    assert list_scatter_sums(trace) == []
+
+
+def test_a_sum_without_a_fixed_order_is_found(monkeypatch):
+    config, env, network, _ = build(load(TOY).experiment)
+
+    def apply(params, observation, carry):
+        output, carry = network.apply(params, observation, carry)
+        value = output.value.reshape(-1)
+        place = (value > 0).astype(jnp.int32)
+        total = jnp.zeros(2).at[place].add(value)
+        return output._replace(value=output.value + 0.0 * total.sum()), carry
+
+    programs = train.compile_programs(
+        config, env, network._replace(apply=apply), Evaluation(number=0), fresh=False
+    )
+    assert programs.unordered
+    assert all("tests/test_manifest.py" in place for place in programs.unordered)
+    reasons = manifest.inexact_because("jax", "fixed", programs.unordered)
+    assert reasons[0].startswith("a sum without a fixed order: scatter")

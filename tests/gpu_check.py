@@ -1,0 +1,108 @@
+"""Is a run the same in two processes on this device, and what do the measures for it cost?
+
+python -m tests.gpu_check -- ant_run --ppo.num-envs 4096 --ppo.num-steps 20000000
+
+What follows `--` is a command line of `python -m purerl.run` without --name, --runs and --resume.
+Each variant is run in two processes, one after the other, each with an empty compilation cache. A
+row says whether the two have the same digest, and how fast they were after the first quarter of the
+run [control steps/s]:
+
+  as it is         nothing set
+  kept kernels     the second process gets the kernels that the first one chose, as a run does that
+                   is resumed on another machine
+  no autotuning    XLA_FLAGS=--xla_gpu_autotune_level=0: nothing is chosen by timing
+  deterministic    XLA_FLAGS=--xla_gpu_deterministic_ops=true, XLA's own measure
+  no measures      MJX's sums left as they are: the speed to compare with, and its digests
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+FLAGS = {
+    "as it is": "",
+    "kept kernels": "",
+    "no autotuning": "--xla_gpu_autotune_level=0",
+    "deterministic": "--xla_gpu_deterministic_ops=true",
+    "no measures": "",
+}
+# The engine's trace as MJX gives it, without purerl's fixed order of sums.
+PLAIN = """
+import sys, jax, purerl.deterministic
+purerl.deterministic.trace_deterministic = lambda f, *x: jax.make_jaxpr(f)(*x)
+from purerl.run import main
+sys.exit(main(sys.argv[1:]))
+"""
+QUIET = ["--evaluation.number", "0", "--checkpoints", "1"]
+
+
+class Result(NamedTuple):
+    """One process."""
+
+    digest: str
+    speed: float  # control steps/s
+    exact: bool  # by its own manifest
+
+
+def main() -> int:
+    """Runs the check; exit code 0 if the runs as they are were the same."""
+    plain = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("tests.gpu_check", description=__doc__, formatter_class=plain)
+    parser.add_argument("--only", nargs="*", default=list(FLAGS), choices=list(FLAGS))
+    parser.add_argument("words", nargs="+", help="-- EXPERIMENT [--option value ...]")
+    options = parser.parse_args()
+    row = "{:15} {:10} {:>12} {:>12}  {:9} {}"
+    print(row.format("variant", "same", "steps/s", "again", "manifest", "digests"), flush=True)
+    found = {}
+    for variant in options.only:
+        with tempfile.TemporaryDirectory() as folder:
+            first, second = twins(variant, options.words, Path(folder))
+        found[variant] = first.digest == second.digest
+        same = "same" if found[variant] else "DIFFERENT"
+        speeds = [f"{result.speed:,.0f}" for result in (first, second)]
+        exact = "exact" if first.exact else "inexact"
+        digests = " ".join(sorted({result.digest[:16] for result in (first, second)}))
+        print(row.format(variant, same, *speeds, exact, digests), flush=True)
+    return 0 if found.get("as it is", True) else 1
+
+
+def twins(variant: str, words: list[str], runs: Path) -> tuple[Result, Result]:
+    """Makes a run twice."""
+    first = make(variant, words, runs, "first")
+    if variant == "kept kernels":
+        kept = next(runs.glob("*/first/kernels"), None)  # none on a CPU
+        if kept is not None:
+            shutil.copytree(kept, kept.parent.parent / "second" / "kernels")
+    return first, make(variant, words, runs, "second")
+
+
+def make(variant: str, words: list[str], runs: Path, name: str) -> Result:
+    """Makes a run in a process of its own; ends the check if it fails."""
+    program = ["-c", PLAIN] if variant == "no measures" else ["-m", "purerl.run"]
+    environment = os.environ | {
+        "JAX_COMPILATION_CACHE_DIR": str(runs / f"cache-{name}"),
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {FLAGS[variant]}".strip(),
+    }
+    done = subprocess.run(
+        [sys.executable, *program, *words, *QUIET, "--runs", str(runs), "--name", name],
+        env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    if done.returncode:
+        sys.exit(f"{variant}, {name} run: exit code {done.returncode}\n{done.stdout}")
+    folder = next(runs.glob(f"*/{name}"))
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").open()]
+    start, end = lines[len(lines) // 4], lines[-1]
+    seconds = end["wall_s"] - start["wall_s"]
+    speed = (end["steps"] - start["steps"]) / seconds if seconds else 0.0
+    facts = json.loads((folder / "manifest.json").read_text())
+    return Result(end["digest"], speed, facts["bit_exact"])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
