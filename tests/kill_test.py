@@ -7,7 +7,7 @@ Each of the runs is killed once, at a moment drawn from the seed: a quarter of t
 (importing, compiling), the others between the first update and the end, saving and evaluating
 included. Then the same command with --resume takes it to its end. A run passes if its
 metrics.jsonl, digests of all checkpoints included, is that of the undisturbed run but for the clock
-(`wall_s`). Exit code 0 if all pass.
+(`wall_s`); with --num-seeds, that of every seed. Exit code 0 if all pass.
 """
 
 import argparse
@@ -30,7 +30,7 @@ STARTING = 0.25  # share of the kills that come before the first update
 class Undisturbed(NamedTuple):
     """What the run is when nobody disturbs it."""
 
-    lines: list[dict]
+    lines: list[list[dict]]  # of each seed's metrics.jsonl
     starting: float  # [s] until the first line of metrics.jsonl
     training: float  # [s] from there to the end
 
@@ -60,8 +60,8 @@ def kill_many(words: list[str], kills: int, seed: int, runs: Path) -> bool:
     """Kills `kills` runs and tells of each; returns whether all ended as the undisturbed one."""
     whole = undisturbed(words, runs)
     times = f"{whole.starting:.1f} s starting, {whole.training:.1f} s training"
-    digest = whole.lines[-1]["digest"]
-    print(f"undisturbed: {len(whole.lines)} lines, digest {digest}, {times}", flush=True)
+    digests = ", ".join(lines[-1]["digest"] for lines in whole.lines)
+    print(f"undisturbed: {len(whole.lines[0])} lines, digest {digests}, {times}", flush=True)
     random = np.random.default_rng(seed)
     results: list[Killed] = []
     while len(results) < kills:
@@ -108,15 +108,15 @@ def kill_once(
     process.kill()
     process.communicate()
     if process.returncode != -signal.SIGKILL:
-        shutil.rmtree(find(runs, name))
+        remove(runs, name)
         return None
-    phase, after = phase_of(runs, name), len(read_lines(runs, name))
-    resume = ["--resume"] if find(runs, name).exists() else []
+    phase, after = phase_of(runs, name), max(map(len, read_lines(runs, name)), default=0)
+    resume = ["--resume"] if find(runs, name) else []
     process = spawn([*words, *resume], runs, name)
     said = process.communicate()[0]
     same = process.returncode == 0 and read_lines(runs, name) == whole.lines
     if same:
-        shutil.rmtree(find(runs, name))
+        remove(runs, name)
     return Killed(same, phase, after, said)
 
 
@@ -130,30 +130,40 @@ def spawn(words: list[str], runs: Path, name: str) -> subprocess.Popen:
 
 def wait_for_lines(process: subprocess.Popen, runs: Path, name: str) -> None:
     """Waits until the run has measured something, or is over."""
-    while not read_lines(runs, name) and process.poll() is None:
+    while not any(read_lines(runs, name)) and process.poll() is None:
         time.sleep(0.01)
 
 
-def find(runs: Path, name: str) -> Path:
-    """Returns a run's folder, whatever its experiment is called."""
-    return next(runs.glob(f"*/{name}"), runs / "none" / name)
+def find(runs: Path, name: str) -> list[Path]:
+    """Returns the folders of a run's seeds, whatever its experiment is called."""
+    return sorted([*runs.glob(f"*/{name}"), *runs.glob(f"*/{name}-seed*")])
 
 
-def read_lines(runs: Path, name: str) -> list[dict]:
-    """Returns the whole lines of metrics.jsonl without the clock."""
-    path = find(runs, name) / "metrics.jsonl"
-    lines = path.read_text().split("\n")[:-1] if path.exists() else []
-    return [{k: v for k, v in json.loads(line).items() if k != "wall_s"} for line in lines]
+def remove(runs: Path, name: str) -> None:
+    """Deletes a run."""
+    for folder in find(runs, name):
+        shutil.rmtree(folder)
+
+
+def read_lines(runs: Path, name: str) -> list[list[dict]]:
+    """Returns the whole lines of each seed's metrics.jsonl, without the clock."""
+    files = [folder / "metrics.jsonl" for folder in find(runs, name)]
+    texts = [file.read_text().split("\n")[:-1] if file.exists() else [] for file in files]
+    return [
+        [{k: v for k, v in json.loads(line).items() if k != "wall_s"} for line in lines]
+        for lines in texts
+    ]
 
 
 def phase_of(runs: Path, name: str) -> str:
     """Tells from the files what a killed process was doing."""
-    folder = find(runs, name)
-    if not (folder / "config.json").exists():
+    folders = find(runs, name)
+    if not all((folder / "config.json").exists() for folder in folders) or not folders:
         return "before there was a run"
-    if not (folder / "metrics.jsonl").exists():
+    if not any((folder / "metrics.jsonl").exists() for folder in folders):
         return "compiling"
-    unfinished = [path.name for path in (folder / "checkpoints").iterdir()]
+    unfinished = [path.name for folder in folders for path in folder.glob("checkpoints/*")]
+    unfinished += [path.name for folder in folders for path in folder.glob("checkpoints/.*")]
     if any("tmp" in name for name in unfinished):
         return "while saving"
     if any(name.startswith(".deleting") for name in unfinished):

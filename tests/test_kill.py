@@ -1,0 +1,18 @@
+"""A few kills at random moments; `python -m tests.kill_test` makes as many as you like."""
+
+import pytest
+
+from tests.kill_test import kill_many
+from tests.test_run import TOY
+
+LONG = [str(TOY), "--ppo.num-steps", "12800", "--checkpoints", "40"]
+
+
+@pytest.mark.parametrize(
+    ("words", "kills"),
+    [(LONG, 2), ([*LONG, "--num-seeds", "3", "--keep", "1"], 2)],
+    ids=["one run", "vmapped seeds"],
+)
+def test_killed_runs_end_as_undisturbed_ones(tmp_path, monkeypatch, words, kills):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
+    assert kill_many(words, kills, seed=5, runs=tmp_path / "runs")
