@@ -180,6 +180,7 @@ class WandbSink:
         self.run = wandb.init(
             project=project, id=run_id, resume="allow", mode=mode, dir=str(folder), name=name,
             config=config, settings=wandb.Settings(console="off"),
+            reinit="create_new",  # several seeds in one process are several W&B runs
         )  # fmt: skip
         self.run.define_metric("update")
         self.run.define_metric("*", step_metric="update")

@@ -167,6 +167,24 @@ def test_the_newest_and_the_best_are_kept(tmp_path):
     assert not list(tmp_path.glob(".deleting*"))
 
 
+def test_of_seeds_together_those_are_kept_that_all_have(tmp_path):
+    ahead, behind = tmp_path / "ahead", tmp_path / "behind"
+    for update in (1, 2, 3, 4):
+        save(ahead, update)
+    for update in (1, 2):
+        save(behind, update)
+    for folder in (ahead, behind):
+        checkpoint.retain(folder, 1, [ahead, behind])
+    assert checkpoint.updates(ahead) == [2, 3, 4] and checkpoint.updates(behind) == [2]
+    found = checkpoint.newest_of_all([ahead, behind], abstract(), print)
+    assert [saved.meta["update"] for saved in found] == [2, 2]
+    checkpoint.forget_after(ahead, 2)
+    assert checkpoint.updates(ahead) == [2]
+    damage_cut(behind / f"{2:012d}")
+    assert checkpoint.newest_of_all([ahead, behind], abstract(), print) == []
+    assert checkpoint.updates(ahead) == [2]
+
+
 def test_a_failed_save_leaves_nothing_and_the_older_one_whole(tmp_path, monkeypatch):
     save(tmp_path, 1)
     (tmp_path / ".deleting-000000000000").mkdir()  # of an earlier crash
