@@ -13,6 +13,7 @@ import json
 import logging
 import os
 import shutil
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -327,6 +328,18 @@ def _flush(path: Path) -> None:
 def _orbax() -> Any:
     """Imports Orbax late (0.3 s), and without its running commentary."""
     logging.getLogger("absl").setLevel(logging.CRITICAL)  # errors are reported by us
+    if sys.unraisablehook is sys.__unraisablehook__:
+        sys.unraisablehook = _print_unraisable
     import orbax.checkpoint
 
     return orbax.checkpoint
+
+
+def _print_unraisable(raised: Any) -> None:
+    """Prints what could not be raised, but for the writes that a failed save leaves under way.
+
+    They end one by one in threads of the storage library, each with the same complaint; the save
+    has been reported as failed by then.
+    """
+    if str(raised.exc_value) != "Event loop is closed":
+        sys.__unraisablehook__(raised)

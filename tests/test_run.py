@@ -2,9 +2,11 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -212,6 +214,38 @@ def test_a_full_disk_does_not_stop_training(whole, tmp_path, monkeypatch, capsys
     assert lines(tmp_path) == lines(whole)
 
 
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system with room for three checkpoints, and a function that makes it larger."""
+    place = tmp_path / "small"
+    place.mkdir()
+
+    def mount(size: str) -> int:
+        words = ["mount", "-t", "tmpfs", "-o", size, "tmpfs", str(place)]
+        return subprocess.run(words, capture_output=True).returncode
+
+    if not shutil.which("mount") or mount("size=300k"):
+        pytest.skip("this machine lets nobody make a small file system")
+    yield place, lambda: mount("remount,size=5m")
+    subprocess.run(["umount", str(place)], check=True)
+
+
+def test_a_truly_full_disk_loses_nothing(whole, tmp_path, small_disk):
+    runs, enlarge = small_disk
+    words = ["--checkpoints", "12", "--keep", "12"]
+    process = spawn(runs, *words, "--no-cache")
+    said, wrong = process.communicate(timeout=120)
+    assert process.returncode == FAILURE, wrong
+    assert "could not be saved" in said and "Traceback" not in said + wrong
+    last = checkpoints(runs)[-1]
+    assert f"the newest on the disk is of update {last}. Make room" in wrong and last < 12
+    assert enlarge() == 0
+    assert start(runs, *words, "--resume") == SUCCESS
+    assert digest(runs) == digest(whole)
+    without = [{k: v for k, v in line.items() if k != "digest"} for line in lines(runs)]
+    assert without == [{k: v for k, v in line.items() if k != "digest"} for line in lines(whole)]
+
+
 def test_a_last_checkpoint_that_fails_is_an_error(tmp_path, monkeypatch, capsys):
     def never(where, leaves, meta):
         raise OSError(28, "No space left on device")
@@ -284,6 +318,33 @@ def test_a_folder_that_is_no_run_is_not_written_to(tmp_path, capsys):
     folder(tmp_path).mkdir(parents=True)
     (folder(tmp_path) / "thesis.tex").write_text("")
     assert "thesis.tex" in refused(capsys, start(tmp_path))
+
+
+@pytest.fixture
+def unprivileged():
+    """Makes this process one that file permissions hold for, and gives it a place to look at."""
+    place = Path(tempfile.mkdtemp())
+    place.chmod(0o755)
+    root = os.geteuid() == 0
+    try:
+        yield lambda: os.seteuid(65534) if root else None, place
+    finally:
+        if root:
+            os.seteuid(0)
+        subprocess.run(["chmod", "-R", "u+w", place], check=True)
+        shutil.rmtree(place)
+
+
+def test_a_read_only_folder_is_told_and_unharmed(whole, unprivileged, capsys):
+    lose_privileges, place = unprivileged
+    shutil.copytree(whole / "toy_experiment", place / "toy_experiment")
+    subprocess.run(["chmod", "-R", "a-w,a+rX", place], check=True)
+    before = [f.read_bytes() for f in sorted(place.rglob("*")) if f.is_file()]
+    lose_privileges()
+    said = refused(capsys, start(place, "--resume"))
+    assert f"{folder(place)} cannot be written: Permission denied" in said
+    assert "cannot be written" in refused(capsys, start(place, "--name", "new"))
+    assert [f.read_bytes() for f in sorted(place.rglob("*")) if f.is_file()] == before
 
 
 def test_a_run_begun_under_other_conditions_lists_them(tmp_path, stop_after, capsys):
