@@ -28,6 +28,7 @@ class Body:
     longest_gap: float  # its own length without the tail: no gap may be wider [m]
     sight: float  # how far ahead it is told of edges [m]
     timestep: float  # of physics [s]
+    mjx_iterations: tuple[int, int]  # of Newton's method and of its line search
 
 
 def _ant_mjcf() -> mjcf.RootElement:
@@ -60,6 +61,7 @@ ANT = Body(
     longest_gap=1.0,
     sight=4.0,
     timestep=0.005,
+    mjx_iterations=(4, 8),
 )
 
 # Trunk, head and limbs, one capsule or ellipsoid a part: what the animal can stand or lie on.
@@ -92,4 +94,7 @@ RODENT = Body(
     longest_gap=0.3,
     sight=1.0,
     timestep=0.004,
+    # In float32, 256 environments under random full-range actions lost 144 states of 102,400 with
+    # (4, 8), none with (10, 20) (H200, jax 0.11.2); at 2 ms, 29 with (4, 8), none with (8, 16).
+    mjx_iterations=(10, 20),
 )

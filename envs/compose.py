@@ -19,9 +19,9 @@ from purerl.physics import choose_engine
 
 PREFIX = "walker/"  # composing puts it before the names of the body's parts
 TORSO_VELOCITY = "torso_velocity"  # a sensor of the walker's centre of mass [m/s]
-# (iterations, line-search iterations). C stops when it has converged, and is fastest when it may;
-# in MJX the whole batch pays for every iteration that any environment needs.
-ITERATIONS = {"c": (100, 50), "jax": (4, 8)}
+# Newton's (iterations, line-search iterations) in C, which stops when it has converged, and is
+# fastest when it may. In MJX the whole batch pays for every iteration: see `Body.mjx_iterations`.
+C_ITERATIONS = (100, 50)
 _GEOM = mujoco.mjtGeom
 _NO_BOX_CONTACT = (_GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_SDF)
 
@@ -74,7 +74,7 @@ def compose(
     mask_contacts(model, body, self_collision)
     round_ellipsoids(model)
     free_boxes(model)
-    set_solver(model, choose_engine(engine), timestep or body.timestep)
+    set_solver(model, body, choose_engine(engine), timestep or body.timestep)
     check_contacts(model, body)
     return _name_parts(model, body, arena)
 
@@ -189,19 +189,20 @@ def free_boxes(model: mujoco.MjModel) -> None:
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
 
 
-def set_solver(model: mujoco.MjModel, engine: str, timestep: float) -> None:
+def set_solver(model: mujoco.MjModel, body: Body, engine: str, timestep: float) -> None:
     """Newton's method, pyramidal cones, `timestep` [s].
 
     dm_control's arenas have elliptic cones, which cost MJX more for no gain in these tasks.
     Implicit damping (eulerdamp) stays on: without it the rodent is NaN at once. For MJX matrices
     are dense: a body of 60 degrees of freedom and more gets sparse ones by default, which bring
-    more sums whose order has to be fixed, and a larger program, for no gain in speed.
+    more sums whose order has to be fixed, and a larger program (rodent: 7.6 MB of HLO, not 5.3).
     """
     model.opt.timestep = timestep
     model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
     model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-    model.opt.iterations, model.opt.ls_iterations = ITERATIONS[engine]
+    model.opt.iterations, model.opt.ls_iterations = C_ITERATIONS
     if engine == "jax":
+        model.opt.iterations, model.opt.ls_iterations = body.mjx_iterations
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
 
 
