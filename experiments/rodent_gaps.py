@@ -1,6 +1,8 @@
 """dm_control's rodent runs along a corridor whose gaps differ in every episode.
 
 python -m purerl.run rodent_gaps
+
+Measured: 0.6 gaps after 3 M steps (38 min on two shared CPU cores); not solved yet.
 """
 
 from envs import run

@@ -1,6 +1,8 @@
 """dm_control's rodent runs forward on a floor.
 
 python -m purerl.run rodent_run
+
+Expected: 1.5 m/s over 10 s episodes after 13 min, on two shared CPU cores.
 """
 
 from envs import run
