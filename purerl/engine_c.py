@@ -9,6 +9,7 @@ import copy
 import functools
 import math
 import threading
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +33,7 @@ _BLOWN_UP = [
 class CEngine:
     """Steps a model with MuJoCo's C code; see `physics.Physics` for what `init`, `step` promise."""
 
-    def __init__(self, model: mujoco.MjModel, record: type, stage: int, substeps: int):
+    def __init__(self, model: mujoco.MjModel, record: Any, stage: int, substeps: int):
         """Remembers the model; simulations are allocated when the batch size is known.
 
         Args:
@@ -110,7 +111,7 @@ def _unpack(row: Array, shapes: list[tuple[int, ...]]) -> list[Array]:
 
 
 def _run_rows(
-    engine: CEngine, fields: tuple[str, ...], names: tuple[str, ...], substeps: int, rows: Array
+    engine: CEngine, fields: tuple[str, ...], names: tuple[str, ...], substeps: int, rows: Any
 ) -> np.ndarray:
     """Runs the simulations of packed rows (host, numpy only).
 

@@ -25,7 +25,7 @@ _IN_IMPL += ("subtree_angmom", "cacc", "cfrc_int", "cfrc_ext")
 class JaxEngine:
     """Steps a model with MJX; see `physics.Physics` for what `init` and `step` promise."""
 
-    def __init__(self, model: mujoco.MjModel, record: type, late: tuple[str, ...], substeps: int):
+    def __init__(self, model: mujoco.MjModel, record: Any, late: tuple[str, ...], substeps: int):
         """Puts the model on the device.
 
         Args:

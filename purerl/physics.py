@@ -129,7 +129,7 @@ class Physics:
         self.model, self.substeps = model, substeps
         self.engine = choose_engine(engine)
         self.control_timestep = substeps * float(model.opt.timestep)
-        record: Any = collections.namedtuple("Readings", readings)  # noqa: PYI024
+        record: Any = collections.namedtuple("Readings", list(readings))  # type: ignore[misc]
         self._engine = _build_engine(self.engine, model, record, substeps)
 
     def init(
