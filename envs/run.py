@@ -67,6 +67,8 @@ class Options:
     """Gaps only: least and greatest length of a gap [m]."""
     corridor_width: float = 4.0
     """Gaps only: beyond half of it on either side, the body falls [m]."""
+    runway: float = 1.0
+    """Gaps only: from the start to the first gap [m]."""
     reward: Literal["speed", "target"] = "speed"
     """The weighted terms below, or dm_control's corridor reward: speed / target_speed in [0, 1]."""
     target_speed: float = 1.0
@@ -280,7 +282,10 @@ def build_arena(options: Options, body: Body) -> Arena:
     if options.arena == "floor":
         return Floor()
     corridor = GapsCorridor(
-        options.platform_length, options.gap_length, width=options.corridor_width
+        options.platform_length,
+        options.gap_length,
+        start_length=GapsCorridor.spawn_x + options.runway,
+        width=options.corridor_width,
     )
     return dataclasses.replace(corridor, boxes=boxes_in_reach(corridor, body.reach))
 

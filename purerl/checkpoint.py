@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from purerl.errors import UserError
-from purerl.types import PyTree
+from purerl.types import PyTree, is_key
 
 Leaves = dict[str, np.ndarray]
 
@@ -58,7 +58,7 @@ def flatten(state: PyTree) -> Leaves:
     The copy is real: on a CPU `device_get` returns views of buffers that the next, donating update
     overwrites.
     """
-    raw = jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, state)
+    raw = jax.tree.map(lambda x: jax.random.key_data(x) if is_key(x) else x, state)
     host = [np.array(x, copy=True, order="C") for x in jax.tree.leaves(jax.device_get(raw))]
     return dict(zip(leaf_paths(state), host, strict=True))
 
@@ -69,7 +69,7 @@ def unflatten(leaves: Leaves, abstract: PyTree) -> PyTree:
     for path, like in zip(leaf_paths(abstract), jax.tree.leaves(abstract), strict=True):
         # A real copy again: a buffer shared with numpy must not be donated.
         array = jnp.array(_empty(like) if like.size == 0 else leaves[path], copy=True)
-        out.append(jax.random.wrap_key_data(array, impl=_impl(like)) if _is_key(like) else array)
+        out.append(jax.random.wrap_key_data(array, impl=_impl(like)) if is_key(like) else array)
     return jax.tree.unflatten(jax.tree.structure(abstract), out)
 
 
@@ -252,21 +252,17 @@ def clean(folder: Path) -> None:
 # --- parts ---
 
 
-def _is_key(x: Any) -> bool:
-    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-
-
 def _impl(key: Any) -> str:
     """Returns the name of a key's implementation; of abstract keys too, which key_impl refuses."""
     return str(jax.random.key_impl(jnp.empty((0,), key.dtype)))
 
 
 def _key_suffix(leaf: Any) -> str:
-    return f"|{_impl(leaf)}" if _is_key(leaf) else ""
+    return f"|{_impl(leaf)}" if is_key(leaf) else ""
 
 
 def _empty(like: Any) -> np.ndarray:
-    if _is_key(like):
+    if is_key(like):
         raise ValueError(f"A zero-size array of keys (shape {like.shape}) cannot be rebuilt.")
     return np.zeros(like.shape, like.dtype)
 
@@ -282,7 +278,7 @@ def _describe(array: np.ndarray) -> dict[str, Any]:
 
 def _check_fits(path: Path, meta: dict[str, Any], abstract: PyTree) -> None:
     raw = jax.eval_shape(
-        lambda s: jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, s), abstract
+        lambda s: jax.tree.map(lambda x: jax.random.key_data(x) if is_key(x) else x, s), abstract
     )
     shapes = [[str(x.dtype), list(x.shape)] for x in jax.tree.leaves(raw)]
     wanted = dict(zip(leaf_paths(abstract), shapes, strict=True))
@@ -327,7 +323,8 @@ def _flush(path: Path) -> None:
 
 def _orbax() -> Any:
     """Imports Orbax late (0.3 s), and without its running commentary."""
-    logging.getLogger("absl").setLevel(logging.CRITICAL)  # errors are reported by us
+    for name in ("absl", "asyncio"):  # errors are reported by us, once for a save
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     if sys.unraisablehook is sys.__unraisablehook__:
         sys.unraisablehook = _print_unraisable
     import orbax.checkpoint

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from purerl.types import Array, PyTree
+from purerl.types import Array, PyTree, is_key
 
 
 class State(struct.PyTreeNode):
@@ -58,17 +58,17 @@ def check_env(env: Env, num_envs: int = 4, num_steps: int = 4) -> None:
     """
     _check_members(env)
     keys = jax.random.split(jax.random.key(0), num_envs)
-    fresh = jax.eval_shape(env.reset, keys[0])
+    fresh = jax.eval_shape(env.reset, jax.random.key(0))
     _check_fields(fresh)
     after = _step_shapes(env, fresh)
     _check_same("reset and step", _specs(fresh), _specs(after))
     reset = jax.jit(jax.vmap(env.reset))
-    state = reset(keys)
+    state = reset(_again(keys))
     _check_bits("equal keys", state, reset(keys), "reset must be a function of its key alone")
     _check_differs(state)
     actions = _actions(num_steps, num_envs, env.action_size)
     rollout = _rollout(env)
-    last, states = rollout(state, actions)
+    last, states = rollout(_again(state), actions)
     _check_finite("reset", state)
     _check_finite("step", states)
     again = rollout(state, actions)[1]
@@ -164,6 +164,11 @@ def _check_same(what: str, first: dict[str, str], second: dict[str, str]) -> Non
             )
 
 
+def _again(tree: PyTree) -> PyTree:
+    """Copies a tree for a second use of its keys, which JAX's key-reuse checking would refuse."""
+    return jax.tree.map(lambda x: jax.random.clone(x) if is_key(x) else x, tree)
+
+
 def _actions(num_steps: int, num_envs: int, size: int) -> Array:
     """Returns actions [3 + T, B, A]: all -1, all 0, all 1, then random ones."""
     corners = jnp.broadcast_to(jnp.array([-1.0, 0.0, 1.0])[:, None, None], (3, num_envs, size))
@@ -186,8 +191,7 @@ def _host_leaves(state: PyTree) -> dict[str, np.ndarray]:
     """Returns path -> values of each leaf; keys as their raw bits."""
     named = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(state):
-        is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-        value = jax.random.key_data(leaf) if is_key else leaf
+        value = jax.random.key_data(leaf) if is_key(leaf) else leaf
         named[jax.tree_util.keystr(path).lstrip(".")] = np.asarray(value)
     return named
 

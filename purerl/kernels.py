@@ -1,46 +1,28 @@
-"""Keeps the kernels that XLA chose for a run, so that a resumed one computes with the same.
+"""Keeps XLA from choosing kernels by timing them, so that every process computes with the same.
 
-On a GPU, XLA times several kernels for an operation and takes the fastest. Two processes may choose
-differently, and other kernels add in another order. JAX keeps the choices in a folder inside its
-compilation cache; a copy of them goes with the run, to be used where that cache does not reach.
+On a GPU, XLA by default times several kernels for an operation and takes the fastest. Two processes
+may choose differently, and other kernels add in another order.
 """
 
 import os
-import shutil
-from pathlib import Path
 
-CHOICES = "xla_gpu_per_fusion_autotune_cache_dir"  # JAX's name for the folder
-KEPT = "kernels"  # in the run's folder
+LEVEL = "xla_gpu_autotune_level"
 FIXING_FLAGS = (
-    "xla_gpu_autotune_level=0",
+    f"{LEVEL}=0",
     "xla_gpu_deterministic_ops=true",
     "xla_gpu_exclude_nondeterministic_ops=true",
 )
 
 
-def how_chosen(platform: str, cache: bool) -> str:
-    """Tells how kernels are chosen: "fixed", "kept with the run", or "anew in each process"."""
+def fix_choice() -> None:
+    """Turns the timing off, where XLA_FLAGS does not set it; to be called before JAX starts."""
     flags = os.environ.get("XLA_FLAGS", "")
-    if platform != "gpu" or any(flag in flags for flag in FIXING_FLAGS):
-        return "fixed"
-    return "kept with the run" if cache else "anew in each process"
+    if not any(name.partition("=")[0] in flags for name in FIXING_FLAGS):
+        os.environ["XLA_FLAGS"] = f"{flags} --{LEVEL}=0".strip()
 
 
-def bring(run: Path, cache: str) -> None:
-    """Puts what a run chose where JAX looks for it; what is there already stays."""
-    _copy_missing(run / KEPT, Path(cache) / CHOICES)
-
-
-def keep(run: Path, cache: str) -> None:
-    """Puts what was chosen beside the run."""
-    _copy_missing(Path(cache) / CHOICES, run / KEPT)
-
-
-def _copy_missing(source: Path, target: Path) -> None:
-    for file in sorted(source.rglob("*")) if source.is_dir() else ():
-        copy = target / file.relative_to(source)
-        if file.is_file() and not copy.exists():
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            draft = copy.with_name(f".{copy.name}.draft")  # others may be reading the folder
-            shutil.copyfile(file, draft)
-            draft.replace(copy)
+def how_chosen(platform: str) -> str:
+    """Tells how kernels are chosen: "fixed", or "by timing" anew in each process."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    fixed = platform != "gpu" or any(flag in flags for flag in FIXING_FLAGS)
+    return "fixed" if fixed else "by timing"

@@ -52,7 +52,7 @@ def execute(
     plan = train.make_plan(setup.config, chosen.evaluation, options.checkpoints, options.log_every)
     schedule = {"log_every": plan.log_every, "checkpoints": options.checkpoints}
     platform = jax.default_backend()
-    chosen_by = kernels.how_chosen(platform, options.cache)
+    chosen_by = kernels.how_chosen(platform)
     facts = manifest.collect(setup.engine, (chosen.build_env, chosen.build_network), chosen_by)
     if vmapped > 1:  # part of what the bits depend on
         facts["vmapped_seeds"] = {"first": chosen.seed, "number": vmapped}
@@ -70,15 +70,11 @@ def execute(
 
     @functools.cache
     def programs() -> train.Programs:
-        if platform == "gpu" and options.cache:
-            for folder in runs:
-                kernels.bring(folder, cache)
         made = train.compile_programs(*setup[:3], chosen.evaluation, fresh, vmapped)
         if platform == "gpu":
             reasons = manifest.inexact_because(setup.engine, chosen_by, made.unordered)
             for folder in runs:
                 rundir.amend(folder, manifest.exactness(reasons))
-                kernels.keep(folder, cache)
         return made
 
     groups = [list(runs)] if vmapped > 1 else [[folder] for folder in runs]

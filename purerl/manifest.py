@@ -72,10 +72,10 @@ def inexact_because(engine: str, kernels: str, unordered: Iterable[str] = ()) ->
     reasons = [f"a sum without a fixed order: {place}" for place in unordered]
     if engine == "warp":
         reasons.append("engine warp: MJX-Warp adds with atomics, in any order")
-    if kernels == "anew in each process":
+    if kernels == "by timing":
         reasons.append(
-            "XLA times the kernels it chooses from anew in each process: leave out --no-cache, or "
-            "set XLA_FLAGS=--xla_gpu_autotune_level=0"
+            "XLA chooses kernels by timing, anew in each process: leave xla_gpu_autotune_level out "
+            "of XLA_FLAGS, or set it to 0"
         )
     return reasons
 

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from purerl import experiment
+from purerl import experiment, kernels
 from purerl.errors import USAGE, RunError, StoppedError, UserError
 from purerl.experiment import Experiment, Source
 
@@ -105,6 +105,7 @@ def resume_command(arguments: Sequence[str]) -> str:
 
 def command(arguments: Sequence[str]) -> None:
     """Parses, prepares and trains."""
+    kernels.fix_choice()  # before JAX starts
     from purerl.cli import parse
     from purerl.launch import execute
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-from purerl import checkpoint, experiment, kernels, manifest, train
+from purerl import checkpoint, experiment, manifest, train
 from purerl.config import Config
 from purerl.env import Env
 from purerl.errors import UserError, one_line
@@ -19,7 +19,6 @@ from purerl.types import Network
 
 LOCK = ".lock"
 OURS = {LOCK, "config.json", "manifest.json", "experiment.py", "metrics.jsonl", "checkpoints"}
-OURS |= {kernels.KEPT}
 
 
 class Setup(NamedTuple):

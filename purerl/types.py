@@ -113,3 +113,8 @@ class TrainState(struct.PyTreeNode):
     update: Array  # [] int32 updates done
     steps: Counter  # control steps taken, all environments together
     skipped_in_a_row: Array  # [] int32 non-finite minibatch updates since the last good one
+
+
+def is_key(x: Any) -> bool:
+    """Tells whether an array, or its shape, is of typed random keys."""
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)

@@ -14,3 +14,4 @@ jax.config.update(
     "jax_compilation_cache_dir", os.path.join(tempfile.gettempdir(), "purerl-test-compilations")
 )
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 2.0)
+jax.config.update("jax_debug_key_reuse", True)  # a key consumed twice raises

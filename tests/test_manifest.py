@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import os
 
 import jax
 import jax.numpy as jnp
@@ -65,26 +66,24 @@ def test_a_manifest_says_whether_the_run_is_exact_and_what_prevents_it(monkeypat
     assert manifest.collect("c", [])["bit_exact"] is True
     warp = manifest.collect("warp", [])
     assert warp["bit_exact"] is False and "warp" in warp["inexact_because"][0]
-    monkeypatch.delenv("XLA_FLAGS", raising=False)
-    assert kernels.how_chosen("cpu", False) == "fixed"
-    assert kernels.how_chosen("gpu", True) == "kept with the run"
-    timed = kernels.how_chosen("gpu", False)
-    assert "--no-cache" in manifest.collect("jax", [], timed)["inexact_because"][0]
-    monkeypatch.setenv("XLA_FLAGS", "--xla_a=b --xla_gpu_autotune_level=0")
-    assert kernels.how_chosen("gpu", False) == "fixed"
 
 
-def test_chosen_kernels_go_with_the_run(tmp_path):
-    run, cache, other = tmp_path / "run", tmp_path / "cache", tmp_path / "other"
-    (cache / kernels.CHOICES).mkdir(parents=True)
-    (cache / kernels.CHOICES / "a.textproto").write_text("first")
-    kernels.keep(run, str(cache))
-    (cache / kernels.CHOICES / "a.textproto").write_text("later")
-    kernels.keep(run, str(cache))
-    kernels.bring(run, str(other))
-    assert (other / kernels.CHOICES / "a.textproto").read_text() == "first"
-    assert len(list(other.rglob("*.*proto*"))) == 1
-    kernels.bring(tmp_path / "no run", str(other))
+@pytest.mark.parametrize(
+    "users, after, chosen",
+    [
+        (None, "--xla_gpu_autotune_level=0", "fixed"),
+        ("--xla_a=b", "--xla_a=b --xla_gpu_autotune_level=0", "fixed"),
+        ("--xla_gpu_autotune_level=4", "--xla_gpu_autotune_level=4", "by timing"),
+        ("--xla_gpu_deterministic_ops=true", "--xla_gpu_deterministic_ops=true", "fixed"),
+    ],
+)
+def test_kernels_are_fixed_unless_the_user_wants_them_timed(monkeypatch, users, after, chosen):
+    monkeypatch.setenv("XLA_FLAGS", users or "")
+    kernels.fix_choice()
+    assert os.environ["XLA_FLAGS"] == after
+    assert kernels.how_chosen("gpu") == chosen and kernels.how_chosen("cpu") == "fixed"
+    reasons = manifest.collect("jax", [], kernels.how_chosen("gpu"))["inexact_because"]
+    assert ["by timing" in reason for reason in reasons] == [True] * (chosen == "by timing")
 
 
 @pytest.mark.parametrize("name", ["cartpole_swingup", "ant_run"])

@@ -124,8 +124,9 @@ class Stretched:
         return self.inner.physics
 
     def reset(self, key):
-        state = self.inner.reset(key)
-        return state.replace(task=jax.random.uniform(key, (), minval=0.1, maxval=0.5))
+        inner, own = jax.random.split(key)
+        state = self.inner.reset(inner)
+        return state.replace(task=jax.random.uniform(own, (), minval=0.1, maxval=0.5))
 
     def step(self, state, action):
         return self.inner.step(state.replace(task=()), action).replace(task=state.task)

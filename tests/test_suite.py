@@ -221,7 +221,7 @@ def test_starts_touch_nothing(name):
     keys = jax.random.split(jax.random.key(3), 128)
     starts = np.asarray(jax.jit(jax.vmap(env.domain.start))(keys).qpos)
     draw = getattr(env.domain, "_place_ball", lambda k: base.random_joints(model, k))
-    poses = np.asarray(jax.vmap(draw)(keys))
+    poses = np.asarray(jax.vmap(draw)(jax.random.clone(keys)))
     pairs = base.touching_pairs(model)
     gap = jax.jit(lambda p, m: base.least_gap(model, pairs, p, m))
     touching = [_contacts(model, data, q) > 0 for q in starts]
