@@ -1,7 +1,5 @@
 """The control suite against dm_control's own tasks: the same states, observations and rewards."""
 
-import importlib
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -12,46 +10,23 @@ from dm_control.rl import control
 from dm_control.suite.utils import randomizers
 from dm_control.utils import rewards
 
-from envs.suite import base
+from envs.suite import base, hopper, tasks
 from envs.suite.rewards import SIGMOIDS, tolerance
 from purerl.env import check_env
 
 STATES = 100
-# Ours -> dm_control's (domain, task).
-TASKS = {
-    ("cartpole", "balance"): ("cartpole", "balance"),
-    ("cartpole", "swingup"): ("cartpole", "swingup"),
-    ("pendulum", None): ("pendulum", "swingup"),
-    ("reacher", "easy"): ("reacher", "easy"),
-    ("reacher", "hard"): ("reacher", "hard"),
-    ("cheetah", None): ("cheetah", "run"),
-    ("hopper", "stand"): ("hopper", "stand"),
-    ("hopper", "hop"): ("hopper", "hop"),
-    ("walker", "stand"): ("walker", "stand"),
-    ("walker", "walk"): ("walker", "walk"),
-    ("walker", "run"): ("walker", "run"),
-    ("humanoid", "stand"): ("humanoid", "stand"),
-    ("humanoid", "walk"): ("humanoid", "walk"),
-    ("humanoid", "run"): ("humanoid", "run"),
-    ("ball_in_cup", None): ("ball_in_cup", "catch"),
-    ("finger", None): ("finger", "spin"),
-    ("acrobot", "swingup"): ("acrobot", "swingup"),
-    ("acrobot", "swingup_sparse"): ("acrobot", "swingup_sparse"),
-    ("swimmer", None): ("swimmer", "swimmer6"),
-}
 
 
-@pytest.fixture(params=TASKS, ids=lambda t: "-".join(filter(None, t)))
+@pytest.fixture(params=tasks.TASKS)
 def pair(request):
     """Our environment on the C engine, and dm_control's."""
-    return ours(request.param), suite.load(*TASKS[request.param], task_kwargs={"random": 0})
+    name = request.param.split("-")
+    return ours(request.param), suite.load(*name, task_kwargs={"random": 0})
 
 
 def ours(name, engine="c"):
-    """Builds an environment by (domain, task)."""
-    module = importlib.import_module(f"envs.suite.{name[0]}")
-    options = module.Options() if name[1] is None else module.Options(task=name[1])
-    return module.build(options, engine)
+    """Builds an environment by its name."""
+    return tasks.build(tasks.Options(name), engine)
 
 
 def flat(observation) -> np.ndarray:
@@ -153,11 +128,19 @@ def test_steps_are_dm_controls(pair):
         np.testing.assert_allclose(state.reward, expected.reward, atol=2e-3)
 
 
-@pytest.mark.parametrize("domain", ["cartpole", "pendulum", "reacher", "acrobot", "ball_in_cup"])
-def test_engines_agree(domain):
+@pytest.mark.parametrize(
+    "name",
+    [
+        "cartpole-swingup",
+        "pendulum-swingup",
+        "reacher-easy",
+        "acrobot-swingup",
+        "ball_in_cup-catch",
+    ],
+)
+def test_engines_agree(name):
     """The domains that MJX compiles in seconds, over 10 random control steps."""
-    module = importlib.import_module(f"envs.suite.{domain}")
-    c, mjx = module.build(engine="c"), module.build(engine="jax")
+    c, mjx = ours(name, "c"), ours(name, "jax")
     first, rng = jax.jit(c.reset)(jax.random.key(0)), np.random.default_rng(0)
     actions = jnp.float32(rng.uniform(-1, 1, (10, c.action_size)))
     last = [
@@ -209,11 +192,13 @@ def test_tolerance_refuses(kwargs):
 
 
 def test_an_unknown_task_is_named():
-    with pytest.raises(ValueError, match="'walk'.*There are: stand, hop"):
-        ours(("hopper", "walk"))
+    with pytest.raises(ValueError, match="'hopper-walk'. Did you mean 'hopper-stand'.*walker-walk"):
+        ours("hopper-walk")
+    with pytest.raises(ValueError, match="stand, hop"):
+        hopper.build(hopper.Options("walk"))
 
 
-@pytest.mark.parametrize("name", [("humanoid", "stand"), ("ball_in_cup", None), ("finger", None)])
+@pytest.mark.parametrize("name", ["humanoid-stand", "ball_in_cup-catch", "finger-spin"])
 def test_starts_touch_nothing(name):
     """In nearly all starts; and the draw sees what MuJoCo sees."""
     env = ours(name)
@@ -244,12 +229,12 @@ def _contacts(model, data, qpos) -> int:
 
 def test_random_joints_have_their_ranges():
     """Against dm_control's own draw, joint by joint: the same least and greatest."""
-    for name in (("walker", "stand"), ("humanoid", "stand"), ("hopper", "hop")):
+    for name in ("walker-stand", "humanoid-stand", "hopper-hop"):
         model = ours(name).physics.model
         qpos = jax.vmap(lambda k, m=model: base.random_joints(m, k))(
             jax.random.split(jax.random.key(0), 2000)
         )
-        physics = suite.load(name[0], name[1]).physics
+        physics = suite.load(*name.split("-")).physics
         rng, theirs = np.random.RandomState(0), []
         for _ in range(2000):
             randomizers.randomize_limited_and_rotational_joints(physics, rng)

@@ -1,0 +1,61 @@
+"""Every task of the suite by its name, `<domain>-<task>`."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from envs.suite import (
+    acrobot,
+    ball_in_cup,
+    cartpole,
+    cheetah,
+    finger,
+    hopper,
+    humanoid,
+    pendulum,
+    reacher,
+    swimmer,
+    walker,
+)
+from envs.suite.base import SuiteEnv
+from purerl.model import unknown_name
+
+TASKS: dict[str, tuple[Any, Any]] = {  # name -> the domain's module and its options
+    "acrobot-swingup": (acrobot, acrobot.Options("swingup")),
+    "acrobot-swingup_sparse": (acrobot, acrobot.Options("swingup_sparse")),
+    "ball_in_cup-catch": (ball_in_cup, ball_in_cup.Options()),
+    "cartpole-balance": (cartpole, cartpole.Options("balance")),
+    "cartpole-swingup": (cartpole, cartpole.Options("swingup")),
+    "cheetah-run": (cheetah, cheetah.Options()),
+    "finger-spin": (finger, finger.Options()),
+    "hopper-hop": (hopper, hopper.Options("hop")),
+    "hopper-stand": (hopper, hopper.Options("stand")),
+    "humanoid-run": (humanoid, humanoid.Options("run")),
+    "humanoid-stand": (humanoid, humanoid.Options("stand")),
+    "humanoid-walk": (humanoid, humanoid.Options("walk")),
+    "pendulum-swingup": (pendulum, pendulum.Options()),
+    "reacher-easy": (reacher, reacher.Options("easy")),
+    "reacher-hard": (reacher, reacher.Options("hard")),
+    "swimmer-swimmer6": (swimmer, swimmer.Options(links=6)),
+    "walker-run": (walker, walker.Options("run")),
+    "walker-stand": (walker, walker.Options("stand")),
+    "walker-walk": (walker, walker.Options("walk")),
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which task."""
+
+    task: Literal[tuple(TASKS)] = "walker-walk"  # type: ignore[valid-type]
+    """Domain and task, as dm_control names them."""
+
+    def __post_init__(self):
+        """Refuses a task that there is not."""
+        if self.task not in TASKS:
+            raise ValueError(unknown_name("task", self.task, tuple(TASKS)))
+
+
+def build(options: Options = Options(), engine: str = "auto") -> SuiteEnv:  # noqa: B008
+    """Builds the task's environment on an engine of `purerl.physics`."""
+    module, settings = TASKS[options.task]
+    return module.build(settings, engine)

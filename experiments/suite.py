@@ -1,0 +1,27 @@
+"""dm_control's control suite, all tasks with the same settings.
+
+python -m purerl.run suite --env.task cheetah-run --name cheetah-run
+"""
+
+from envs.suite import tasks
+from purerl import networks
+from purerl.config import Config
+from purerl.experiment import Evaluation, Experiment
+
+experiment = Experiment(
+    build_env=tasks.build,
+    env=tasks.Options(),
+    build_network=networks.mlp,
+    network=networks.MlpOptions(policy_hidden=(128, 128), value_hidden=(128, 128)),
+    ppo=Config(
+        num_steps=3_000_000,
+        num_envs=128,
+        rollout_length=64,
+        num_epochs=4,
+        num_minibatches=8,
+        learning_rate=3e-4,
+        schedule="adaptive_kl",
+        reward_scale=0.1,
+    ),
+    evaluation=Evaluation(num_episodes=32, number=6),
+)
