@@ -1,0 +1,102 @@
+"""Other trainers beside ours: the same thing is simulated, and the same sizes are learned."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+pytest.importorskip("gymnasium", reason="needs the extra peers")
+
+import gymnasium  # noqa: E402
+
+from envs import gymnasium_ant  # noqa: E402
+from purerl.env import check_env  # noqa: E402
+
+STEPS = 200
+
+
+def starting_at(state, data):
+    """Returns our state with the simulation of Gymnasium's `data`."""
+    fields = {name: jnp.asarray(getattr(data, name), jnp.float32) for name in ("qpos", "qvel")}
+    warm = jnp.asarray(data.qacc_warmstart, jnp.float32)
+    return state.replace(physics=state.physics.replace(qacc_warmstart=warm, **fields))
+
+
+@pytest.fixture(scope="module")
+def steps():
+    """Single steps from states on Gymnasium's way: (its observation, reward, terminated), ours."""
+    theirs, env = gymnasium.make("Ant-v5").unwrapped, gymnasium_ant.build(engine="c")
+    step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.key(0))
+    actions = np.random.default_rng(0).uniform(-1, 1, (STEPS, env.action_size))
+    theirs.reset(seed=0)
+    found = []
+    for action in actions:
+        before = starting_at(state, theirs.data)
+        observation, reward, terminated, _, _ = theirs.step(action)
+        ours = step(before, jnp.asarray(action, jnp.float32))
+        found.append((observation, reward, terminated, jax.device_get(ours)))
+        if terminated:
+            theirs.reset()
+    return found
+
+
+def test_it_keeps_to_the_protocol():
+    check_env(gymnasium_ant.build(engine="c"))
+
+
+def test_positions_and_velocities_are_gymnasiums(steps):
+    for observation, _, _, ours in steps:
+        assert ours.observation.shape == observation.shape == (105,)
+        np.testing.assert_allclose(ours.observation[:27], observation[:27], atol=1e-4)
+
+
+def test_contact_forces_are_on_gymnasiums_bodies(steps):
+    """Taken a moment earlier: a body that has just touched, or let go, differs."""
+    theirs = np.array([s[0][27:].reshape(13, 6) for s in steps])
+    ours = np.array([s[3].observation[27:].reshape(13, 6) for s in steps])
+    touched = (np.abs(theirs) > 0).any(2) & (np.abs(ours) > 0).any(2)
+    assert touched.sum() > 30
+    assert np.isclose(ours, theirs, atol=0.01)[touched].mean() > 0.7
+    assert ((np.abs(theirs) > 0).any(2) == (np.abs(ours) > 0).any(2)).mean() > 0.97
+
+
+def test_rewards_and_ends_are_gymnasiums(steps):
+    ends = [terminated for _, _, terminated, _ in steps]
+    assert 0 < sum(ends) < STEPS
+    assert [bool(ours.terminated) for *_, ours in steps] == ends
+    differences = [abs(reward - ours.reward) for _, reward, _, ours in steps]
+    # Gymnasium's position is that of its integrator's last stage, 1e-3 m away at most.
+    assert np.median(differences) < 0.005
+    assert max(differences) < 0.06
+
+
+def test_starts_are_spread_as_gymnasiums():
+    theirs = gymnasium.make("Ant-v5").unwrapped
+    theirs.reset(seed=0)
+    expected = np.array([theirs.reset()[0] for _ in range(2000)])
+    env = gymnasium_ant.build(engine="c")
+    keys = jax.random.split(jax.random.key(0), 2000)
+    starts = np.asarray(jax.jit(jax.vmap(env.reset))(keys).observation)
+    np.testing.assert_allclose(starts.mean(0), expected.mean(0), atol=0.02)
+    np.testing.assert_allclose(starts.std(0), expected.std(0), atol=0.01)
+    np.testing.assert_allclose(starts.max(0)[:13], expected.max(0)[:13], atol=0.01)
+
+
+def test_both_trainers_learn_with_equal_sizes():
+    """Counts stable-baselines3's gradient steps and parameters, and ours."""
+    pytest.importorskip("stable_baselines3", reason="needs the extra peers")
+    from experiments import peers
+
+    sizes = peers.Sizes((16, 8), "swish", samples=512, minibatch=64, epochs=2)
+    part = peers.sb3(sizes, 2, processes=False, threads=1)
+    model = part.call.model
+    assert model.num_timesteps == part.steps == 512
+    assert model._n_updates == sizes.epochs
+    assert (model.n_steps, model.n_envs, model.batch_size) == (256, 2, 64)
+    config, network = peers.our_config(sizes), peers.our_network(sizes)
+    assert config.steps_per_update == 512
+    assert config.samples_per_update // config.num_minibatches == sizes.minibatch
+    built = peers.experiment.build_network(network, jnp.zeros(105), 8)
+    params = built.init(jax.random.key(0))[0]
+    number = sum(x.size for x in jax.tree.leaves(params))
+    assert number == sum(p.numel() for p in model.policy.parameters())
