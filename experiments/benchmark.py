@@ -1,31 +1,41 @@
-"""Where the time goes: physics alone, rollout, learner, whole update, evaluation of an experiment.
+"""Where time and memory go: physics, rollout, learner, update, evaluation of an experiment.
 
     python -m experiments.benchmark ant_run
     python -m experiments.benchmark ant_run --engine jax --ppo.num-envs 4096 --json out.json
+    python -m experiments.benchmark ant_run --start-up    # from the command to the first update
 
 Each part is compiled by itself and timed in rounds, part after part, so that a busy moment of the
 machine falls on all of them; the median of the rounds counts. Rates are control steps per second.
 "Physics alone" is the bare engine under random controls: no network, no reward, no observation.
+
+Memory: the run's state; one update, its state and what the compiled program needs beside it; and
+the most that the device has held, where it counts, or else the process, everything included (the
+`c` engine's simulations too, which XLA does not see).
 """
 
 import argparse
 import json
+import resource
 import statistics
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from purerl import cli, ppo, run, rundir
+from experiments import start_up
+from purerl import cli, kernels, ppo, run, rundir
+from purerl.console import size
 from purerl.evaluation import evaluate
 from purerl.experiment import Experiment, find
 from purerl.model import scale_action
 from purerl.rollout import rollout
 from purerl.types import Array, PyTree, TrainState
+
+PARTS = ("physics alone", "rollout", "learner", "update", "evaluation")
 
 
 class Part(NamedTuple):
@@ -35,6 +45,15 @@ class Part(NamedTuple):
     call: Callable[[], PyTree]
     steps: int | None  # control steps it takes; None: as many as its result says
     compile_s: float
+    temporary: int  # bytes that it needs beside its arguments and results
+
+
+class Bench(NamedTuple):
+    """An experiment's programs, and the state that they share."""
+
+    parts: list[Part]
+    state: TrainState
+    num_envs: int
 
 
 class Timing(NamedTuple):
@@ -68,15 +87,15 @@ def bare_physics(env: Any, config: ppo.Config, state: TrainState, key: Array) ->
     return jax.lax.scan(step, state.env.physics, jnp.arange(config.rollout_length))[0]
 
 
-def make_parts(experiment: Experiment, num_episodes: int) -> list[Part]:
-    """Compiles every part of an experiment on its engine."""
+def make_bench(experiment: Experiment, names: Sequence[str] = PARTS) -> Bench:
+    """Compiles the parts of an experiment on its engine."""
     config, env, network, _ = rundir.build(experiment)
     key = jax.random.key(experiment.seed)
     state = jax.jit(partial(ppo.init, config, env, network))(key)
     state, transitions, _, last = jax.jit(partial(rollout, config, env, network))(state)
     first = state.episode.length == 0
     batch = jax.jit(partial(ppo.make_batch, config))(state, transitions, last, first)
-    steps = config.steps_per_update
+    steps, episodes = config.steps_per_update, experiment.evaluation.num_episodes
     programs: list[tuple[str, Callable, tuple, int | None]] = [
         ("physics alone", partial(bare_physics, env, config), (state, key), steps),
         ("rollout", partial(rollout, config, env, network), (state,), steps),
@@ -84,14 +103,15 @@ def make_parts(experiment: Experiment, num_episodes: int) -> list[Part]:
         ("update", partial(ppo.update, config, env, network), (state,), steps),
         (
             "evaluation",
-            partial(evaluate, config, env, network, num_episodes=num_episodes),
+            partial(evaluate, config, env, network, num_episodes=episodes),
             (state, key),
             None,
         ),
     ]
     if not hasattr(env, "physics"):
         programs = programs[1:]
-    return [compile_part(*program) for program in programs]
+    parts = [compile_part(*program) for program in programs if program[0] in names]
+    return Bench(parts, state, config.num_envs)
 
 
 def compile_part(name: str, function: Callable, arguments: tuple, steps: int | None) -> Part:
@@ -100,7 +120,8 @@ def compile_part(name: str, function: Callable, arguments: tuple, steps: int | N
     compiled = jax.jit(function).lower(*arguments).compile()
     seconds = time.perf_counter() - start
     jax.block_until_ready(compiled(*arguments))
-    return Part(name, lambda: compiled(*arguments), steps, seconds)
+    temporary = compiled.memory_analysis().temp_size_in_bytes
+    return Part(name, lambda: compiled(*arguments), steps, seconds, temporary)
 
 
 def measure(parts: list[Part], rounds: int, least_s: float) -> list[Timing]:
@@ -119,6 +140,29 @@ def measure(parts: list[Part], rounds: int, least_s: float) -> list[Timing]:
     medians = {name: statistics.median(values) for name, values in samples.items()}
     return [Timing(p.name, p.compile_s, medians[p.name], steps[p.name] / medians[p.name])
             for p in parts]  # fmt: skip
+
+
+def memory(bench: Bench) -> dict[str, int]:
+    """Returns what -> bytes.
+
+    An update of a run works on its own state: the new one takes the place of the old one.
+    """
+    found = {"state": size(jax.eval_shape(lambda: bench.state))}
+    for part in bench.parts:
+        if part.name == "update":
+            found["update"] = found["state"] + part.temporary
+    counted = jax.devices()[0].memory_stats()
+    if counted:
+        return found | {"device, at most": counted["peak_bytes_in_use"]}
+    kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # as Linux counts
+    return found | {"process, at most": 1024 * kib}
+
+
+def memory_table(found: dict[str, int], num_envs: int) -> str:
+    """Formats what -> bytes."""
+    lines = ["| memory | MB | bytes per environment |", "|---|---|---|"]
+    lines += [f"| {k} | {v / 1e6:,.1f} | {v / num_envs:,.0f} |" for k, v in found.items()]
+    return "\n".join(lines)
 
 
 def table(timings: list[Timing]) -> str:
@@ -142,18 +186,25 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--rounds", type=int, default=5, help="rounds of the measurement")
     parser.add_argument("--least-s", type=float, default=1.0, help="least time of a part [s]")
     parser.add_argument("--json", default="", help="also write the figures to this file")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="only these")
+    parser.add_argument("--start-up", action="store_true", help="time a cold and a warm start")
     options, overrides = parser.parse_known_args(arguments)
+    if options.start_up:
+        return start_up.main([options.experiment, *overrides])
+    kernels.fix_choice()  # as a run does, before JAX starts
     prog = f"python -m experiments.benchmark {options.experiment}"
     experiment, _ = run.from_command_line(cli.parse, find(options.experiment), overrides, prog)
-    timings = measure(
-        make_parts(experiment, experiment.evaluation.num_episodes), options.rounds, options.least_s
-    )
+    bench = make_bench(experiment, options.parts)
+    timings = measure(bench.parts, options.rounds, options.least_s)
+    held = memory(bench)
     device = jax.devices()[0].device_kind
-    print(f"{options.experiment} {' '.join(overrides)} on {device}\n{table(timings)}")
+    print(f"{options.experiment} {' '.join(overrides)} on {device}\n{table(timings)}\n")
+    print(memory_table(held, bench.num_envs))
     if options.json:
         rows = [timing._asdict() for timing in timings]
+        about = {"experiment": options.experiment, "overrides": overrides, "device": device}
         with open(options.json, "w") as file:
-            json.dump({"experiment": options.experiment, "device": device, "parts": rows}, file)
+            json.dump(about | {"parts": rows, "memory": held}, file)
     return 0
 
 

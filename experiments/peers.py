@@ -89,7 +89,7 @@ def ours(sizes: Sizes) -> Part:
     trainer = Ours(update, state)
     trainer()
     name = f"purerl, engine {engine}, {config.num_envs} environments"
-    return Part(name, trainer, config.steps_per_update, 0.0)
+    return Part(name, trainer, config.steps_per_update, 0.0, 0)
 
 
 @dataclass
@@ -133,7 +133,7 @@ def sb3(sizes: Sizes, num_envs: int, processes: bool, threads: int) -> Part:
     trainer = Peer(model, sizes.samples)
     trainer()
     name = f"stable-baselines3, {num_envs} x {kind.__name__}"
-    return Part(name, trainer, sizes.samples, 0.0)
+    return Part(name, trainer, sizes.samples, 0.0, 0)
 
 
 def make_parts(setting: str, threads: int) -> list[Part]:

@@ -1,0 +1,141 @@
+"""How cost grows: steps/s and memory over environments, rollout length, width and seeds.
+
+    python -m experiments.scaling --csv docs/scaling.csv
+    python -m experiments.scaling --axes envs --experiment ant_run --engine jax
+
+One axis varies, the rest stays as the experiment has it; a minibatch holds at most 1024 samples, so
+that the learner's work for a sample is the same everywhere. Each point is a benchmark in a process
+of its own (memory is the most that process held) and times the bare physics in turns with the
+update: the share says what the trainer costs, whatever else the machine was doing. Over seeds, the
+rate is that of all seeds together, one program of vmapped updates.
+"""
+
+import argparse
+import csv
+import dataclasses
+import json
+import subprocess
+import sys
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from experiments.benchmark import compile_part, measure
+from purerl import ppo, rundir
+from purerl.experiment import Experiment, find
+
+AXES: dict[str, tuple[int, ...]] = {
+    "envs": (64, 256, 1024, 4096, 16384),
+    "length": (8, 32, 128),
+    "width": (32, 128, 512),
+    "seeds": (1, 2, 4, 8),
+}
+FIELDS = ("axis", "value", "steps_per_s", "physics_steps_per_s", "share", "compile_s")
+FIELDS += ("state_mb", "update_mb", "process_mb")
+MINIBATCH = 1024
+SHORT = 8  # steps of a rollout over environments: 16,384 of them take long enough
+
+
+def overrides(axis: str, value: int, config: Any) -> list[str]:
+    """Returns the options that put one axis at a value."""
+    envs = value if axis == "envs" else config.num_envs
+    length = {"envs": SHORT, "length": value}.get(axis, config.rollout_length)
+    sizes = {
+        "num-envs": envs,
+        "rollout-length": length,
+        "num-minibatches": max(envs * length // MINIBATCH, 1),
+    }
+    words = [word for name, size in sizes.items() for word in (f"--ppo.{name}", str(size))]
+    if axis == "width":
+        for name in ("policy", "value"):
+            words += [f"--network.{name}-hidden", str(value), str(value)]
+    return words
+
+
+def point(experiment: Experiment, name: str, engine: str, axis: str, value: int) -> dict[str, Any]:
+    """Measures one point in a process of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "found.json"
+        command = [sys.executable, "-m", "experiments.benchmark", name, "--engine", engine]
+        command += ["--rounds", "2", "--least-s", "0.5", "--json", str(file)]
+        command += ["--parts", "physics alone", "update"]
+        command += overrides(axis, value, experiment.ppo)
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        found = json.loads(file.read_text())
+    physics, update = found["parts"]
+    held = found["memory"]
+    rates = update["steps_per_second"], physics["steps_per_second"]
+    return {
+        "axis": axis,
+        "value": value,
+        "steps_per_s": round(rates[0]),
+        "physics_steps_per_s": round(rates[1]),
+        "share": round(rates[0] / rates[1], 3),
+        "compile_s": round(update["compile_s"], 1),
+        "state_mb": round(held["state"] / 1e6, 2),
+        "update_mb": round(held["update"] / 1e6, 2),
+        "process_mb": round(list(held.values())[-1] / 1e6),
+    }
+
+
+def seeds_point(experiment: Experiment, engine: str, number: int) -> dict[str, Any]:
+    """Measures the update of vmapped seeds."""
+    chosen = dataclasses.replace(experiment, engine=engine)
+    config, env, network, _ = rundir.build(chosen)
+    keys = jax.random.split(jax.random.key(chosen.seed), number)
+    state = jax.jit(jax.vmap(partial(ppo.init, config, env, network)))(keys)
+    update = jax.vmap(partial(ppo.update, config, env, network))
+    part = compile_part("update", update, (state,), number * config.steps_per_update)
+    rate = measure([part], 3, 0.5)[0].steps_per_second
+    return {"axis": "seeds", "value": number, "steps_per_s": round(rate),
+            "compile_s": round(part.compile_s, 1)}  # fmt: skip
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Formats the points."""
+    lines = [f"| {' | '.join(FIELDS)} |", "|" + "---|" * len(FIELDS)]
+    lines += [f"| {' | '.join(str(row.get(field, '')) for field in FIELDS)} |" for row in rows]
+    return "\n".join(lines)
+
+
+def write(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Writes the points measured, in place of those of the same axes; other axes stay."""
+    old = list(csv.DictReader(path.open())) if path.exists() else []
+    axes = {row["axis"] for row in rows}
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows([*(row for row in old if row["axis"] not in axes), *rows])
+
+
+def main(arguments: list[str]) -> int:
+    """Measures the axes that the command line names."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--axes", nargs="+", choices=tuple(AXES), default=tuple(AXES))
+    parser.add_argument("--experiment", default="ant_run")
+    parser.add_argument("--seeds-experiment", default="cartpole_swingup", help="for the axis seeds")
+    parser.add_argument("--engine", default="auto")
+    parser.add_argument("--csv", default="", help="also write the points to this file")
+    options = parser.parse_args(arguments)
+    experiment = find(options.experiment).experiment
+    rows = []
+    for axis in options.axes:
+        for value in AXES[axis]:
+            if axis == "seeds":
+                seeds = find(options.seeds_experiment).experiment
+                rows.append(seeds_point(seeds, options.engine, value))
+            else:
+                rows.append(point(experiment, options.experiment, options.engine, axis, value))
+    print(table(rows))
+    if options.csv:
+        write(Path(options.csv), rows)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
