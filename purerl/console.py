@@ -35,7 +35,8 @@ def describe_plan(
         f"parameters   {count(abstract.params):,}",
         f"state        {size(abstract) / 1e6:,.1f} MB",
         f"engine       {setup.engine}",
-        f"device       {device['count']} x {device['kind']} ({device['platform']})",
+        *_shards(setup, facts),
+        f"device       {facts['devices']} x {device['kind']} ({device['platform']})",
         f"cache        {cache}",
         f"bit-exact    {_exactness(facts)}",
     ]
@@ -43,6 +44,14 @@ def describe_plan(
 
 def _exactness(facts: dict[str, Any]) -> str:
     return "yes" if facts["bit_exact"] else f"no: {'; '.join(facts['inexact_because'])}"
+
+
+def _shards(setup: Setup, facts: dict[str, Any]) -> list[str]:
+    number, devices = facts["num_shards"], facts["devices"]
+    if number == 1:
+        return []
+    each = f"{setup.config.num_envs // number} environments each, {number // devices} on a device"
+    return [f"shards       {number}, {each}"]
 
 
 def _seeds(runs: list[Path], facts: dict[str, Any]) -> list[str]:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from purerl.config import Config
 from purerl.distributions import sample
 from purerl.env import Env, State
-from purerl.keys import per_environment
+from purerl.keys import Purpose, derive, per_environment
 from purerl.rollout import act, episode_metric, is_lost, repeat_step, select, start_episodes
 from purerl.types import Array, EpisodeStats, Metrics, Network, PyTree, TrainState
 
@@ -73,6 +73,14 @@ def evaluate(
         "episode_length": episode.length.astype(jnp.float32),
         "lost": end.lost.astype(jnp.float32),
     }
+
+
+def evaluate_in_run(
+    config: Config, env: Env, network: Network, num_episodes: int, state: TrainState
+) -> Metrics:
+    """Evaluates the deterministic policy on episodes that depend on seed and update alone."""
+    key = derive(state.key, Purpose.EVALUATION, state.update)
+    return evaluate(config, env, network, state, key, num_episodes)
 
 
 def _step(

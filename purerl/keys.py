@@ -32,6 +32,6 @@ def derive(key: Array, purpose: Purpose, *indices: Array | int) -> Array:
     return key
 
 
-def per_environment(key: Array, num_envs: int) -> Array:
-    """Returns one key per environment [B], by environment index."""
-    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(num_envs))
+def per_environment(key: Array, num_envs: int, first: Array | int = 0) -> Array:
+    """Returns one key per environment [B], by environment index, from `first` on."""
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(num_envs) + first)

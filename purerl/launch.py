@@ -7,7 +7,7 @@ an update that all of them have on the disk.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from purerl import checkpoint, console, kernels, manifest, rundir, train
+from purerl import checkpoint, console, kernels, manifest, ppo, rundir, spread, train
 from purerl.errors import RunError, UserError
 from purerl.experiment import Experiment, Source
 from purerl.loggers import BackgroundLogger, Say, TensorBoardSink, WandbSink, check_installed
 from purerl.recorder import Recorder
 from purerl.run_video import RunVideo
+from purerl.shards import Shards, check_sizes
 from purerl.types import PyTree, TrainState
 
 if TYPE_CHECKING:
@@ -49,11 +50,13 @@ def execute(
     loggers = needed_loggers(options)
     cache = set_up_jax(options.cache)
     setup = rundir.build(chosen)
+    shards = choose_shards(setup, runs, options)
     plan = train.make_plan(setup.config, chosen.evaluation, options.checkpoints, options.log_every)
     schedule = {"log_every": plan.log_every, "checkpoints": options.checkpoints}
     platform = jax.default_backend()
     chosen_by = kernels.how_chosen(platform)
-    facts = manifest.collect(setup.engine, (chosen.build_env, chosen.build_network), chosen_by)
+    builders = (chosen.build_env, chosen.build_network)
+    facts = manifest.collect(setup.engine, builders, chosen_by, shards.number)
     if vmapped > 1:  # part of what the bits depend on
         facts["vmapped_seeds"] = {"first": chosen.seed, "number": vmapped}
     for folder in runs:
@@ -70,7 +73,10 @@ def execute(
 
     @functools.cache
     def programs() -> train.Programs:
-        made = train.compile_programs(*setup[:3], chosen.evaluation, fresh, vmapped)
+        if shards.number > 1:
+            made = spread.compile_programs(*setup[:3], chosen.evaluation, fresh, shards)
+        else:
+            made = train.compile_programs(*setup[:3], chosen.evaluation, fresh, vmapped)
         if platform == "gpu":
             reasons = manifest.inexact_because(setup.engine, chosen_by, made.unordered)
             for folder in runs:
@@ -87,6 +93,33 @@ def execute(
             failed.append(str(error))
     if failed:
         raise RunError(" ".join(failed))
+
+
+def choose_shards(setup: rundir.Setup, folders: Iterable[Path], options: "Options") -> Shards:
+    """Returns the shards asked for, or those of the run that goes on, or one for each device.
+
+    Raises:
+      UserError: devices, shards, environments and minibatches do not divide as they must.
+    """
+    begun = [folder for folder in folders if (folder / "config.json").exists()]
+    number, devices = options.num_shards, jax.device_count()
+    if not number and begun:
+        number = rundir.read_json(begun[0] / "manifest.json").get("num_shards", 1)
+    if vmapped_seeds(options) > 1:
+        if number > 1:
+            raise UserError(
+                f"num_shards is {number}, and {options.num_seeds} vmapped seeds share one program "
+                "on one device; use --seeds-by map, or leave out --num-shards."
+            )
+        number = 1
+    number = number or devices
+    shards = Shards(number, devices if number > 1 else 1)
+    try:
+        check_sizes(shards, setup.config.num_envs)
+        ppo.check_sizes(setup.config, train.abstract_state(*setup[:3]).carry, number)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    return shards
 
 
 def vmapped_seeds(options: "Options") -> int:
@@ -124,7 +157,16 @@ def train_together(
         if options.video:  # of the first seed: one such process is enough
             recorders[0].loggers.append(RunVideo(folders[0], stop, progress.say))
         meta["fingerprint"] = manifest.fingerprint(facts)
-        train.train(plan, programs(), state, recorders, progress, stop, progress.say, meta)
+        train.train(
+            plan,
+            programs(),
+            programs().spread(state),
+            recorders,
+            progress,
+            stop,
+            progress.say,
+            meta,
+        )
         for folder, recorder in zip(folders, recorders, strict=True):
             of = f" of {folder.name}" if options.num_seeds > 1 else ""
             progress.say(f"Done: {plan.steps:,} steps{of}. Digest {recorder.digest}")

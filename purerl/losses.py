@@ -3,21 +3,49 @@
 Every mean is weighted: `weight` is 1 for a sound sample and 0 for one whose physics blew up.
 """
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 
+from purerl.shards import WHOLE, Shards, total
 from purerl.types import Array
 
 
-def weighted_mean(x: Array, weight: Array) -> Array:
+class Scale(NamedTuple):
+    """What the parts of a minibatch must agree on."""
+
+    weight: Array  # [] sum of the weights, at least 1
+    mean: Array  # [] of the advantages
+    std: Array  # []
+
+
+def weighted_mean(x: Array, weight: Array, shards: Shards = WHOLE) -> Array:
     """Returns sum(weight * x) / sum(weight), [], over all axes; 0 where all weights are 0."""
-    return (weight * x).sum() / jnp.maximum(weight.sum(), 1.0)
+    whole, weights = total(shards, lambda x, w: ((w * x).sum(), w.sum()), x, weight)
+    return whole / jnp.maximum(weights, 1.0)
 
 
-def normalize_advantage(advantage: Array, weight: Array) -> Array:
+def weighted_variance(x: Array, weight: Array, mean: Array, shards: Shards = WHOLE) -> Array:
+    """Returns the weighted mean of (x - mean)^2, [], over all axes."""
+
+    def sums(x: Array, w: Array) -> tuple[Array, Array]:
+        return (w * jnp.square(x - mean)).sum(), w.sum()
+
+    whole, weights = total(shards, sums, x, weight)
+    return whole / jnp.maximum(weights, 1.0)
+
+
+def advantage_scale(advantage: Array, weight: Array, shards: Shards = WHOLE) -> Scale:
+    """Returns weighted mean and standard deviation of a minibatch's advantages."""
+    mean = weighted_mean(advantage, weight, shards)
+    variance = weighted_variance(advantage, weight, mean, shards)
+    weights = jnp.maximum(total(shards, jnp.sum, weight), 1.0)
+    return Scale(weight=weights, mean=mean, std=jnp.sqrt(variance))
+
+
+def normalize_advantage(advantage: Array, scale: Scale) -> Array:
     """Returns the advantage with weighted mean 0 and standard deviation 1, same shape."""
-    mean = weighted_mean(advantage, weight)
-    variance = weighted_mean(jnp.square(advantage - mean), weight)
-    return (advantage - mean) / (jnp.sqrt(variance) + 1e-8)
+    return (advantage - scale.mean) / (scale.std + 1e-8)
 
 
 def clipped_surrogate(log_ratio: Array, advantage: Array, clip: float) -> Array:
@@ -47,9 +75,10 @@ def approximate_kl(log_ratio: Array) -> Array:
     return jnp.expm1(log_ratio) - log_ratio
 
 
-def explained_variance(value: Array, target: Array, weight: Array) -> Array:
+def explained_variance(value: Array, target: Array, weight: Array, shards: Shards = WHOLE) -> Array:
     """Returns 1 - Var(target - value) / Var(target), []: 1 is perfect, 0 no better than a mean."""
     residual = target - value
-    unexplained = weighted_mean(jnp.square(residual - weighted_mean(residual, weight)), weight)
-    total = weighted_mean(jnp.square(target - weighted_mean(target, weight)), weight)
-    return 1.0 - unexplained / jnp.maximum(total, 1e-8)
+    mean = weighted_mean(residual, weight, shards)
+    unexplained = weighted_variance(residual, weight, mean, shards)
+    mean = weighted_mean(target, weight, shards)
+    return 1.0 - unexplained / jnp.maximum(weighted_variance(target, weight, mean, shards), 1e-8)

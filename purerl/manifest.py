@@ -20,17 +20,24 @@ from typing import Any
 PACKAGES = ["jax", "jaxlib", "mujoco", "mujoco-mjx", "dm-control", "flax", "optax", "numpy"]
 PACKAGES += ["orbax-checkpoint"]
 INFORMATIVE = {"run_id", "git_revision", "git_dirty", "allowed_changes"}
-INFORMATIVE |= {"bit_exact", "inexact_because"}  # what they follow from is compared itself
+INFORMATIVE |= {
+    "devices",
+    "bit_exact",
+    "inexact_because",
+}  # what they follow from is compared itself
 FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE", "JAX_PLATFORMS", "JAX_ENABLE_X64")
 
 
-def collect(engine: str, builders: Iterable[Callable], kernels: str = "fixed") -> dict[str, Any]:
+def collect(
+    engine: str, builders: Iterable[Callable], kernels: str = "fixed", num_shards: int = 1
+) -> dict[str, Any]:
     """Describes this process: all that decides a run's bits apart from the run's own settings.
 
     Args:
       engine: the physics engine in use, resolved ("auto" is not an answer).
       builders: functions whose source folders are part of the run (build_env, build_network).
       kernels: `kernels.how_chosen`.
+      num_shards: V; on how many devices share them the bits do not depend.
     """
     import jax
 
@@ -38,22 +45,23 @@ def collect(engine: str, builders: Iterable[Callable], kernels: str = "fixed") -
     about = {
         "platform": device.platform,
         "kind": _device_kind(device),
-        "count": jax.device_count(),
     }
     if device.platform == "cpu":  # XLA's pool size changes the bits of matrix products on a CPU
-        about["threads"] = cpu_threads()
+        about["threads"] = max(cpu_threads(), jax.local_device_count())
     options = jax.config.values
     return (
         {
             "versions": {"python": platform.python_version()} | {p: _version(p) for p in PACKAGES},
             "device": about,
+            "num_shards": num_shards,
+            "devices": jax.device_count() if num_shards > 1 else 1,
             "engine": engine,
             "kernels": kernels,
             "matmul_precision": options["jax_default_matmul_precision"] or "default",
             "x64": options["jax_enable_x64"],
             "prng": options["jax_default_prng_impl"],
             "threefry_partitionable": options["jax_threefry_partitionable"],
-            "flags": {name: os.environ[name] for name in FLAGS if name in os.environ},
+            "flags": flags(),
             "source": source_hash(builders),
         }
         | exactness(inexact_because(engine, kernels))
@@ -83,6 +91,15 @@ def inexact_because(engine: str, kernels: str, unordered: Iterable[str] = ()) ->
 def exactness(reasons: list[str]) -> dict[str, Any]:
     """Returns what manifest.json says of a run's exactness."""
     return {"bit_exact": not reasons, "inexact_because": reasons}
+
+
+def flags() -> dict[str, str]:
+    """Returns the environment variables that bits depend on, without what says how many devices."""
+    found = {name: os.environ[name] for name in FLAGS if name in os.environ}
+    if "XLA_FLAGS" in found:
+        words = found["XLA_FLAGS"].split()
+        found["XLA_FLAGS"] = " ".join(w for w in words if "platform_device_count" not in w)
+    return found
 
 
 def cpu_threads() -> int:

@@ -10,10 +10,13 @@ which never forms a growing sum. Both additions are compensated (Kahan), because
 samples an increment is smaller than the last bit of the mean. The count is an exact 64-bit one.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from flax import struct
 
+from purerl.shards import add_in_order
 from purerl.types import Array, Counter, PyTree, add_count, count_as_float, zero_count
 
 # A feature that never moved has variance 0; the floor keeps its first movement finite.
@@ -60,26 +63,29 @@ def _like(feature: Array, x: Array) -> Array:
     return jnp.expand_dims(feature, tuple(range(x.ndim - feature.ndim)))
 
 
+class Moments(NamedTuple):
+    """What a batch adds to statistics; of V shards [V, ...]."""
+
+    number: Array  # [] uint32 samples
+    delta: PyTree  # [O] mean of the batch, less that of the statistics
+    spread: PyTree  # [O] population variance of the batch
+
+
 def update(statistics: Statistics, batch: PyTree, valid: Array) -> Statistics:
     """Merges `batch` (leaves [..., O]) where `valid` ([...] bool) into the statistics."""
-    number = valid.sum(dtype=jnp.uint32)
-    count = add_count(statistics.count, number)
-    share = number.astype(jnp.float32) / jnp.maximum(count_as_float(count), 1.0)
-    merged = jax.tree.map(
-        lambda x, mean, variance: _merge(x, valid, share, mean, variance),
-        batch,
-        statistics.mean,
-        statistics.variance,
-    )
-    mean = jax.tree.map(lambda _, pair: pair[0], batch, merged)
-    variance = jax.tree.map(lambda _, pair: pair[1], batch, merged)
-    return Statistics(count=count, mean=mean, variance=variance)
+    return merge(statistics, moments(statistics, batch, valid))
 
 
-def _merge(
-    x: Array, valid: Array, share: Array, mean: Compensated, variance: Compensated
-) -> tuple[Compensated, Compensated]:
-    """Merges one leaf `x` [..., O] whose samples make up `share` [] of the new total."""
+def moments(statistics: Statistics, batch: PyTree, valid: Array) -> Moments:
+    """Returns the moments of `batch` (leaves [..., O]) where `valid` ([...] bool)."""
+    pairs = jax.tree.map(lambda x, mean: _moments(x, valid, mean), batch, statistics.mean)
+    delta = jax.tree.map(lambda _, pair: pair[0], batch, pairs)
+    spread = jax.tree.map(lambda _, pair: pair[1], batch, pairs)
+    return Moments(valid.sum(dtype=jnp.uint32), delta, spread)
+
+
+def _moments(x: Array, valid: Array, mean: Compensated) -> tuple[Array, Array]:
+    """Returns mean (less the old one) and variance [O] of one leaf `x` [..., O]."""
     axes = tuple(range(valid.ndim))
     mask = jnp.expand_dims(valid, tuple(range(valid.ndim, x.ndim)))
     number = jnp.maximum(valid.sum(dtype=jnp.float32), 1.0)
@@ -87,8 +93,42 @@ def _merge(
     deviation = jnp.where(mask, x - _like(mean.value, x), 0.0)
     delta = deviation.sum(axes) / number
     spread = jnp.where(mask, jnp.square(deviation - _like(delta, x)), 0.0).sum(axes) / number
-    increment = share * (spread - variance.value) + share * (1.0 - share) * jnp.square(delta)
-    return _add(mean, share * delta), _add(variance, increment)
+    return delta, spread
+
+
+def pool(parts: Moments) -> Moments:
+    """Returns the moments of V shards together, from those of each [V, ...], in their order."""
+    number = add_in_order(parts.number)
+    share = parts.number.astype(jnp.float32) / jnp.maximum(number.astype(jnp.float32), 1.0)
+
+    def mean(x: Array) -> Array:
+        return add_in_order(jnp.expand_dims(share, tuple(range(1, x.ndim))) * x)
+
+    delta = jax.tree.map(mean, parts.delta)
+    spread = jax.tree.map(
+        lambda s, d, whole: mean(s + jnp.square(d - _like(whole, d))),
+        parts.spread,
+        parts.delta,
+        delta,
+    )
+    return Moments(number, delta, spread)
+
+
+def merge(statistics: Statistics, batch: Moments) -> Statistics:
+    """Merges a batch into the statistics."""
+    count = add_count(statistics.count, batch.number)
+    share = batch.number.astype(jnp.float32) / jnp.maximum(count_as_float(count), 1.0)
+    mean = jax.tree.map(lambda delta, mean: _add(mean, share * delta), batch.delta, statistics.mean)
+    variance = jax.tree.map(
+        lambda delta, spread, variance: _add(
+            variance,
+            share * (spread - variance.value) + share * (1.0 - share) * jnp.square(delta),
+        ),
+        batch.delta,
+        batch.spread,
+        statistics.variance,
+    )
+    return Statistics(count=count, mean=mean, variance=variance)
 
 
 def _add(total: Compensated, increment: Array) -> Compensated:

@@ -1,7 +1,11 @@
 """Proximal policy optimisation (Schulman et al. 2017, arXiv:1707.06347).
 
-One update, in the order you would explain it: `rollout`, `targets`, E epochs of K
-`minibatch_step`s, then the statistics. `init` and `update` are pure; jit each as a whole, once.
+One update, in the order you would explain it: `collect` (rollout, targets), then `improve` (E
+epochs of K `minibatch_step`s, then the statistics). `init` and `update` are pure; jit each as a
+whole, once.
+
+`update` is one device's. Several devices call `collect` for each shard of the environments, and
+`improve` together (`shards.py`, `spread.py`).
 """
 
 from typing import NamedTuple
@@ -13,9 +17,10 @@ import optax
 from purerl import losses, normalizer
 from purerl.config import Config, check_divides
 from purerl.env import Env
-from purerl.gae import gae
 from purerl.keys import Purpose, derive, per_environment
 from purerl.rollout import Finished, Transition, rollout, start_episodes
+from purerl.shards import WHOLE, Shards, gather, move, numbers, total
+from purerl.targets import Batch, make_batch
 from purerl.types import (
     Array,
     Counter,
@@ -28,20 +33,17 @@ from purerl.types import (
     zero_count,
 )
 
-__all__ = ["Config", "init", "update"]
+__all__ = ["Config", "collect", "improve", "init", "make_batch", "update"]
 
 
-class Batch(NamedTuple):
-    """What the losses read; a rollout's is [T, B, ...], a minibatch's [T', M', ...]."""
+class Experience(NamedTuple):
+    """What an update learns from; one shard's, or a device's shards, stacked [v, ...]."""
 
-    observation: PyTree  # [..., O] normalized
-    raw_action: Array  # [..., A]
-    log_prob: Array  # [...] under the policy that acted
-    old_value: Array  # [...]
-    advantage: Array  # [...]
-    target: Array  # [...] of the value
-    weight: Array  # [...] 0 where the physics blew up, else 1
-    first: Array  # [...] bool: an episode begins here, so the memory starts from zero
+    batch: Batch  # [T, B]
+    memory: PyTree  # [B, H] the policy's at the start of the rollout
+    observations: normalizer.Moments
+    returns: normalizer.Moments  # of the discounted return
+    sums: Metrics  # name -> []
 
 
 class Learner(NamedTuple):
@@ -66,14 +68,12 @@ def is_recurrent(carry: PyTree) -> bool:
     return len(jax.tree.leaves(carry)) > 0
 
 
-def check_sizes(config: Config, carry: PyTree) -> None:
-    """Raises ValueError unless the minibatches divide the rollout."""
-    if is_recurrent(carry):
-        check_divides("num_envs", config.num_envs, "num_minibatches", config.num_minibatches)
-    else:
-        whole = config.samples_per_update
-        name = "num_envs * rollout_length"
-        check_divides(name, whole, "num_minibatches", config.num_minibatches)
+def check_sizes(config: Config, carry: PyTree, number: int = 1) -> None:
+    """Raises ValueError unless the minibatches divide the rollout of each of `number` shards."""
+    size, name = config.num_envs // number, "num_envs / num_shards" if number > 1 else "num_envs"
+    if not is_recurrent(carry):
+        size, name = size * config.rollout_length, f"{name} * rollout_length"
+    check_divides(name, size, "num_minibatches", config.num_minibatches)
 
 
 def init(config: Config, env: Env, network: Network, key: Array) -> TrainState:
@@ -113,20 +113,57 @@ def update(
     Returns the next state and metrics, name -> [] float32. Observation and return statistics
     stay as they are until the end, so that the first policy ratio is exactly 1.
     """
-    memory = state.carry
-    first = state.episode.length == 0
-    state, transitions, finished, last_value = rollout(config, env, network, state)
-    batch = make_batch(config, state, transitions, last_value, first)
-    state, learning = learn(config, network, state, batch, memory)
-    state = state.replace(
-        normalizer=normalizer.update(state.normalizer, transitions.observation, transitions.valid),
-        reward_normalizer=normalizer.update(
+    state, experience = collect(config, env, network, state)
+    return improve(config, network, state, experience)
+
+
+def collect(
+    config: Config, env: Env, network: Network, state: TrainState, first: Array | int = 0
+) -> tuple[TrainState, Experience]:
+    """Acts for T steps in the environments of `state`, all or one shard's.
+
+    Args:
+      config: the hyperparameters.
+      env: the environment.
+      network: the network.
+      state: with as many environments as are to act; they are moved on.
+      first: number of the first of them among all.
+    """
+    memory, opening = state.carry, state.episode.length == 0
+    state, transitions, finished, last_value = rollout(config, env, network, state, first)
+    experience = Experience(
+        batch=make_batch(config, state, transitions, last_value, opening),
+        memory=memory,
+        observations=normalizer.moments(
+            state.normalizer, transitions.observation, transitions.valid
+        ),
+        returns=normalizer.moments(
             state.reward_normalizer, transitions.discounted_return, transitions.valid
         ),
+        sums=rollout_sums(config, transitions, finished),
+    )
+    return state, experience
+
+
+def improve(
+    config: Config,
+    network: Network,
+    state: TrainState,
+    experience: Experience,
+    shards: Shards = WHOLE,
+) -> tuple[TrainState, Metrics]:
+    """Learns from what all shards have collected; reads nothing of the environments in `state`."""
+    batch, memory, observations, returns, sums = experience
+    state, learning = learn(config, network, state, batch, memory, shards)
+    if shards.number > 1:
+        observations, returns = map(normalizer.pool, gather(shards, (observations, returns)))
+    state = state.replace(
+        normalizer=normalizer.merge(state.normalizer, observations),
+        reward_normalizer=normalizer.merge(state.reward_normalizer, returns),
         update=state.update + 1,
         steps=count_steps(config, state.steps),
     )
-    return state, learning | rollout_metrics(config, transitions, finished)
+    return state, learning | rollout_metrics(total(shards, lambda x: x, sums))
 
 
 def count_steps(config: Config, steps: Counter) -> Counter:
@@ -134,67 +171,33 @@ def count_steps(config: Config, steps: Counter) -> Counter:
     return add_count(steps, jnp.asarray(config.steps_per_update, jnp.uint32))
 
 
-def reward_factor(config: Config, state: TrainState) -> Array:
-    """Returns what rewards are multiplied by before learning, []."""
-    if config.reward_scaling == "constant":
-        return jnp.asarray(config.reward_scale, jnp.float32)
-    variance = state.reward_normalizer.variance.value
-    return config.reward_scale * jax.lax.rsqrt(variance + normalizer.VARIANCE_FLOOR)
-
-
-def next_values(transitions: Transition, last_value: Array) -> Array:
-    """Returns V(s'_t) [T, B]: the next row's value, or the one kept at a truncation."""
-    following = jnp.concatenate([transitions.value[1:], last_value[None]])
-    return jnp.where(transitions.truncated, transitions.truncation_value, following)
-
-
-def make_batch(
-    config: Config, state: TrainState, transitions: Transition, last_value: Array, first: Array
-) -> Batch:
-    """Computes advantages and value targets once, [T, B]; `first` [B] opens the rollout."""
-    advantage = jax.vmap(gae, in_axes=(1, 1, 1, 1, 1, 1, None, None), out_axes=1)(
-        transitions.reward * reward_factor(config, state),
-        transitions.value,
-        next_values(transitions, last_value),
-        transitions.terminated,
-        transitions.done,
-        transitions.valid,
-        config.gamma,
-        config.gae_lambda,
-    )
-    return Batch(
-        observation=normalizer.normalize(state.normalizer, transitions.observation),
-        raw_action=transitions.raw_action,
-        log_prob=transitions.log_prob,
-        old_value=transitions.value,
-        advantage=advantage,
-        target=advantage + transitions.value,
-        weight=transitions.valid.astype(jnp.float32),
-        first=jnp.concatenate([first[None], transitions.done[:-1]]),
-    )
-
-
 def learn(
-    config: Config, network: Network, state: TrainState, batch: Batch, memory: PyTree
+    config: Config,
+    network: Network,
+    state: TrainState,
+    batch: Batch,
+    memory: PyTree,
+    shards: Shards = WHOLE,
 ) -> tuple[TrainState, Metrics]:
-    """E epochs of K minibatches; `memory` [B, H] is the policy's at the start of the rollout."""
-    recurrent = is_recurrent(memory)
-    if not recurrent:
+    """E epochs of K minibatches; `memory` [B, H] is the policy's at the start of the rollout.
+
+    Each shard shuffles its own samples, and has an equal part in every minibatch.
+    """
+    if not is_recurrent(memory):
         # One long row of samples: a minibatch is any of them, [1, M].
-        batch = jax.tree.map(lambda x: x.reshape(1, -1, *x.shape[2:]), batch)
-    columns = batch.weight.shape[1]
+        batch = move(shards, _in_one_row, batch)
+    columns = batch.weight.shape[-1]
     learner = Learner(state.params, state.optimizer, state.learning_rate, state.skipped_in_a_row)
     learner = learner._replace(learning_rate=scheduled_rate(config, state))
     key = derive(state.key, Purpose.PERMUTATION, state.update)
 
     def step(learner: Learner, index: Array) -> tuple[Learner, Metrics]:
-        minibatch = jax.tree.map(lambda x: jnp.take(x, index, axis=1), batch)
-        start = jax.tree.map(lambda x: jnp.take(x, index, axis=0), memory)
-        return minibatch_step(config, network, learner, minibatch, start)
+        minibatch, start = move(shards, _take, batch, memory, index)
+        return minibatch_step(config, network, learner, minibatch, start, shards)
 
     def epoch(learner: Learner, number: Array) -> tuple[Learner, Metrics]:
-        order = jax.random.permutation(jax.random.fold_in(key, number), columns)
-        return jax.lax.scan(step, learner, order.reshape(config.num_minibatches, -1))
+        order = shuffle(jax.random.fold_in(key, number), columns, config.num_minibatches, shards)
+        return jax.lax.scan(step, learner, order)
 
     learner, metrics = jax.lax.scan(epoch, learner, jnp.arange(config.num_epochs))
     state = state.replace(**learner._asdict())
@@ -210,10 +213,31 @@ def learn(
         "learning_rate": learner.learning_rate,
         "parameter_norm": optax.tree.norm(learner.params),
         "explained_variance": losses.explained_variance(
-            batch.old_value, batch.target, batch.weight
+            batch.old_value, batch.target, batch.weight, shards
         ),
     }
     return state, metrics
+
+
+def _in_one_row(batch: Batch) -> Batch:
+    return jax.tree.map(lambda x: x.reshape(1, -1, *x.shape[2:]), batch)
+
+
+def _take(batch: Batch, memory: PyTree, index: Array) -> tuple[Batch, PyTree]:
+    minibatch = jax.tree.map(lambda x: jnp.take(x, index, axis=1), batch)
+    return minibatch, jax.tree.map(lambda x: jnp.take(x, index, axis=0), memory)
+
+
+def shuffle(key: Array, columns: int, minibatches: int, shards: Shards) -> Array:
+    """Returns which of a shard's columns each minibatch takes: [K, M], or [K, v, M] of shards."""
+    if shards.number == 1:
+        return jax.random.permutation(key, columns).reshape(minibatches, -1)
+
+    def alone(number: Array) -> Array:
+        order = jax.random.permutation(jax.random.fold_in(key, number), columns)
+        return order.reshape(minibatches, -1)
+
+    return jnp.swapaxes(move(shards, alone, numbers(shards)), 0, 1)
 
 
 def scheduled_rate(config: Config, state: TrainState) -> Array:
@@ -243,13 +267,21 @@ def unroll(network: Network, params: PyTree, batch: Batch, memory: PyTree) -> Po
 
 
 def loss(
-    config: Config, network: Network, params: PyTree, batch: Batch, memory: PyTree
+    config: Config,
+    network: Network,
+    params: PyTree,
+    scale: losses.Scale,
+    batch: Batch,
+    memory: PyTree,
 ) -> tuple[Array, Metrics]:
-    """Returns policy loss + value_weight * value loss - entropy_weight * entropy, [], metrics."""
+    """Returns policy loss + value_weight * value loss - entropy_weight * entropy, [], metrics.
+
+    Of one shard's part of a minibatch with the advantages' `scale`: all parts' add up to the whole.
+    """
     distribution = config.action_distribution
     output = unroll(network, params, batch, memory)
     log_ratio = distribution.log_prob(output.distribution, batch.raw_action) - batch.log_prob
-    advantage = losses.normalize_advantage(batch.advantage, batch.weight)
+    advantage = losses.normalize_advantage(batch.advantage, scale)
     policy = losses.clipped_surrogate(log_ratio, advantage, config.clip)
     value = losses.value_loss(output.value, batch.old_value, batch.target, config.value_clip)
     entropy = distribution.entropy(output.distribution)
@@ -261,26 +293,35 @@ def loss(
         "kl": losses.approximate_kl(log_ratio),
         "clip_fraction": clipped,
     }
-    means = {name: losses.weighted_mean(term, batch.weight) for name, term in terms.items()}
-    total = (
+    means = {k: (batch.weight * term).sum() / scale.weight for k, term in terms.items()}
+    objective = (
         means["policy_loss"]
         + config.value_weight * means["value_loss"]
         - config.entropy_weight * means["entropy"]
     )
-    return total, means
+    return objective, means
 
 
 def minibatch_step(
-    config: Config, network: Network, learner: Learner, batch: Batch, memory: PyTree
+    config: Config,
+    network: Network,
+    learner: Learner,
+    batch: Batch,
+    memory: PyTree,
+    shards: Shards,
 ) -> tuple[Learner, Metrics]:
     """One gradient step, skipped and counted if any of it is not finite."""
+    scale = losses.advantage_scale(batch.advantage, batch.weight, shards)
 
-    def objective(params: PyTree) -> tuple[Array, Metrics]:
-        return loss(config, network, params, batch, memory)
+    def part(batch: Batch, memory: PyTree) -> tuple[tuple[Array, Metrics], PyTree]:
+        def objective(params: PyTree) -> tuple[Array, Metrics]:
+            return loss(config, network, params, scale, batch, memory)
 
-    (total, metrics), gradients = jax.value_and_grad(objective, has_aux=True)(learner.params)
+        return jax.value_and_grad(objective, has_aux=True)(learner.params)
+
+    (objective, metrics), gradients = total(shards, part, batch, memory)
     norm = optax.tree.norm(gradients)
-    sound = jnp.isfinite(total) & jnp.isfinite(norm)
+    sound = jnp.isfinite(objective) & jnp.isfinite(norm)
     updates, optimizer_state = optimizer(config).update(gradients, learner.optimizer)
     stepped = jax.tree.map(lambda p, u: p - learner.learning_rate * u, learner.params, updates)
     params, optimizer_state = jax.tree.map(
@@ -295,7 +336,7 @@ def minibatch_step(
         skipped_in_a_row=jnp.where(sound, 0, learner.skipped_in_a_row + 1),
     )
     skipped = 1.0 - sound.astype(jnp.float32)
-    return learner, metrics | {"loss": total, "gradient_norm": norm, "skipped": skipped}
+    return learner, metrics | {"loss": objective, "gradient_norm": norm, "skipped": skipped}
 
 
 def next_rate(config: Config, rate: Array, kl: Array, sound: Array) -> Array:
@@ -313,20 +354,28 @@ def next_rate(config: Config, rate: Array, kl: Array, sound: Array) -> Array:
     return jnp.where(sound, moved, rate)
 
 
-def rollout_metrics(config: Config, transitions: Transition, finished: Finished) -> Metrics:
-    """Summarises a rollout: sums of counts, means over the episodes that ended in it."""
-    episodes = finished.episodes.sum()
-
-    def mean(total: Array) -> Array:
-        return total.sum() / jnp.maximum(episodes, 1.0)
-
+def rollout_sums(config: Config, transitions: Transition, finished: Finished) -> Metrics:
+    """Adds up what `rollout_metrics` needs over a rollout's steps and environments."""
+    valid = transitions.valid.astype(jnp.float32)
     replayed = jnp.maximum(finished.resets - config.resets_per_update, 0)
     return {
-        "reward": losses.weighted_mean(transitions.reward, transitions.valid.astype(jnp.float32)),
-        "episodes": episodes,
-        "episode_return": mean(finished.episode_return),
-        "episode_length": mean(finished.length),
+        "reward": (valid * transitions.reward).sum(),
+        "valid": valid.sum(),
+        "episodes": finished.episodes.sum(),
+        "episode_return": finished.episode_return.sum(),
+        "episode_length": finished.length.sum(),
         "nonfinite_resets": finished.nonfinite_resets.sum().astype(jnp.float32),
         "replayed_resets": replayed.sum().astype(jnp.float32),
-        **{f"episode/{name}": mean(total) for name, total in finished.metrics.items()},
+        **{f"episode/{name}": x.sum() for name, x in finished.metrics.items()},
     }
+
+
+def rollout_metrics(sums: Metrics) -> Metrics:
+    """Summarises a rollout: sums of counts, means over the episodes that ended in it."""
+    sums = dict(sums)
+    reward = sums.pop("reward") / jnp.maximum(sums.pop("valid"), 1.0)
+    episodes = jnp.maximum(sums["episodes"], 1.0)
+    means = {
+        k: x / episodes for k, x in sums.items() if k.startswith("episode") and k != "episodes"
+    }
+    return {"reward": reward} | sums | means

@@ -163,9 +163,9 @@ def truncation_values(
     return jax.lax.cond(truncated.any(), values, lambda: jnp.zeros(truncated.shape))
 
 
-def draw_pool(config: Config, env: Env, key: Array, update: Array) -> State:
-    """Draws this update's fresh starts, [R, B, ...]: R for each environment."""
-    keys = per_environment(derive(key, Purpose.RESET, update), config.num_envs)
+def draw_pool(config: Config, env: Env, update_key: Array, size: int, first: Array | int) -> State:
+    """Draws this update's fresh starts, [R, B, ...]: R for each of B environments from `first`."""
+    keys = per_environment(update_key, size, first)
 
     def start(number: Array) -> State:
         return jax.vmap(lambda key: env.reset(jax.random.fold_in(key, number)))(keys)
@@ -218,18 +218,19 @@ def nothing_finished(state: State) -> Finished:
 
 
 def rollout(
-    config: Config, env: Env, network: Network, state: TrainState
+    config: Config, env: Env, network: Network, state: TrainState, first: Array | int = 0
 ) -> tuple[TrainState, Transition, Finished, Array]:
-    """Acts for T steps.
+    """Acts for T steps in the environments of `state`, which are number `first` and following.
 
     Returns `state` with environments, memory and running episodes moved on, the transitions
     [T, B, ...], the episodes that finished, and the value of the last observation [B].
     """
-    pool = draw_pool(config, env, state.key, state.update)
+    size = state.discounted_return.shape[0]
+    pool = draw_pool(config, env, derive(state.key, Purpose.RESET, state.update), size, first)
     action_key = derive(state.key, Purpose.ACTION, state.update)
 
     def step(carry: Carry, t: Array) -> tuple[Carry, Transition]:
-        keys = per_environment(jax.random.fold_in(action_key, t), config.num_envs)
+        keys = per_environment(jax.random.fold_in(action_key, t), size, first)
         return _policy_step(config, env, network, state, pool, carry, keys)
 
     start = Carry(

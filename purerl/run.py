@@ -30,7 +30,7 @@ from purerl.experiment import Experiment, Source
 
 @dataclass(frozen=True)
 class Options:
-    """How a run is made, kept and shown; but for vmapped seeds, nothing here changes its bits."""
+    """How a run is made, kept and shown; only vmapped seeds and num_shards change its bits."""
 
     name: str | None = None
     """Name of the run, the folder under runs/<experiment>/ (default: seed<seed>)."""
@@ -39,6 +39,9 @@ class Options:
     seeds_by: Literal["vmap", "map"] = "vmap"
     """vmap: all in one program, with the statistics of single runs but other bits; map: one after
     another, with the bits of single runs."""
+    num_shards: int = 0
+    """Cut the environments into this many parts, a multiple of the devices that share them: on any
+    number of devices the bits are the same. 0: a part for each device; 1: use one device."""
     resume: bool = False
     """Go on from the last whole checkpoint of the run."""
     allow_changes: bool = False
@@ -69,7 +72,7 @@ class Options:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}.")
 
 
-_LEAST = {"num_seeds": 1, "log_every": 0, "checkpoints": 0, "keep": 1}
+_LEAST = {"num_seeds": 1, "num_shards": 0, "log_every": 0, "checkpoints": 0, "keep": 1}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -20,9 +20,8 @@ from purerl.config import Config
 from purerl.deterministic import list_scatter_sums
 from purerl.env import Env
 from purerl.errors import RunError, StoppedError
-from purerl.evaluation import evaluate
+from purerl.evaluation import evaluate_in_run
 from purerl.experiment import Evaluation
-from purerl.keys import Purpose, derive
 from purerl.loggers import Record, Say, summarize
 from purerl.recorder import Recorder
 from purerl.types import Array, Metrics, Network, PyTree, TrainState, count_as_int
@@ -73,13 +72,18 @@ def evenly(number: int, updates: int, every: int) -> tuple[int, ...]:
 
 
 class Programs(NamedTuple):
-    """A run's compiled functions; of S vmapped seeds every array has a leading axis [S]."""
+    """A run's compiled functions; of S vmapped seeds every array has a leading axis [S].
+
+    `update` and `evaluate` take a TrainState, or what `spread` makes of one for several devices.
+    """
 
     init: Callable[[Array], TrainState]
-    update: Callable[[TrainState], tuple[TrainState, Metrics]]
-    evaluate: Callable[[TrainState], Metrics]
+    update: Callable[[Any], tuple[Any, Metrics]]
+    evaluate: Callable[[Any], Metrics]
     seconds: dict[str, float]  # that compiling each took
     unordered: list[str]  # sums of the update whose order nothing fixes on a GPU
+    spread: Callable[[TrainState], Any] = lambda state: state  # onto the devices, for the others
+    fetch: Callable[[Any], TrainState] = lambda state: state  # back onto one
 
 
 def abstract_state(config: Config, env: Env, network: Network) -> PyTree:
@@ -99,7 +103,7 @@ def compile_programs(
     # Initialisation is one program too: computed eagerly, its bits are others.
     init = functools.partial(ppo.init, config, env, network)
     update = functools.partial(ppo.update, config, env, network)
-    judge = functools.partial(evaluate_in_run, config, env, network, evaluation)
+    judge = functools.partial(evaluate_in_run, config, env, network, evaluation.num_episodes)
     key = jax.random.key(0)
     if vmapped_seeds > 1:
         init, update, judge = jax.vmap(init), jax.vmap(update), jax.vmap(judge)
@@ -130,14 +134,6 @@ def _compile(name: str, function: Any, argument: PyTree, seconds: dict[str, floa
     compiled = function.lower(argument).compile()
     seconds[name] = time.perf_counter() - start
     return compiled
-
-
-def evaluate_in_run(
-    config: Config, env: Env, network: Network, evaluation: Evaluation, state: TrainState
-) -> Metrics:
-    """Evaluates the deterministic policy on episodes that depend on seed and update alone."""
-    key = derive(state.key, Purpose.EVALUATION, state.update)
-    return evaluate(config, env, network, state, key, evaluation.num_episodes)
 
 
 def summarize_evaluation(metrics: Metrics) -> Record:
@@ -206,7 +202,7 @@ def train(
             say(describe_evaluation(records, plan))
         planned = update in plan.checkpoints
         if planned or stop():
-            _save(state, records, recorders, meta, planned)
+            _save(programs.fetch(state), records, recorders, meta, planned)
             safe = update
         else:
             for recorder, record in zip(recorders, records, strict=True):

@@ -28,6 +28,7 @@ EFFECTS = {
     "run_video",
     "rundir",
     "scene",
+    "spread",
     "train",
     "twins",
     "video",

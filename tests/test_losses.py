@@ -53,13 +53,15 @@ def test_value_loss_plain_and_clipped():
 def test_weight_zero_removes_a_sample():
     x, weight = array(1.0, 100.0, 3.0), array(1.0, 0.0, 1.0)
     assert losses.weighted_mean(x, weight) == 2.0
-    normalized = losses.normalize_advantage(x, weight)
+    normalized = losses.normalize_advantage(x, losses.advantage_scale(x, weight))
     np.testing.assert_allclose(normalized[jnp.array([0, 2])], [-1.0, 1.0], rtol=1e-6)
 
 
 def test_advantage_normalized_over_all_axes():
     advantage = jax.random.normal(jax.random.key(0), (7, 5)) * 3.0 + 2.0
-    normalized = np.asarray(losses.normalize_advantage(advantage, jnp.ones((7, 5))))
+    normalized = np.asarray(
+        losses.normalize_advantage(advantage, losses.advantage_scale(advantage, jnp.ones((7, 5))))
+    )
     np.testing.assert_allclose(normalized.mean(), 0.0, atol=1e-6)
     np.testing.assert_allclose(normalized.std(), 1.0, rtol=1e-5)
 

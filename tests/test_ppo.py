@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from purerl import networks, normalizer, ppo
+from purerl import networks, normalizer, ppo, targets
 from purerl.env import State
 from purerl.rollout import rollout
 from purerl.types import count_as_int
@@ -294,7 +294,7 @@ def test_adaptive_learning_rate(kl, factor):
 def test_reward_scaling_by_the_running_return():
     config = dataclasses.replace(CONFIG, reward_scaling="return_std")
     env, network, state = setup(config)
-    assert ppo.reward_factor(config, state) == 1.0
+    assert targets.reward_factor(config, state) == 1.0
     _, transitions, _, _ = ROLLOUT(config, env, network, state)
     state, _ = UPDATE(config, env, network, state)
     # By hand: G_t = gamma G_{t-1} + r_t, from 0 after each end.
@@ -304,7 +304,7 @@ def test_reward_scaling_by_the_running_return():
         running = 0.9 * running + r
         returns.append(running.copy())
         running[d] = 0.0
-    np.testing.assert_allclose(ppo.reward_factor(config, state), 1 / np.std(returns), rtol=1e-4)
+    np.testing.assert_allclose(targets.reward_factor(config, state), 1 / np.std(returns), rtol=1e-4)
 
 
 def test_the_same_seed_learns_the_same_bits_and_another_does_not():

@@ -1,0 +1,104 @@
+"""The batch cut into V shards, so that bits do not depend on how many devices D share them.
+
+A shard is always computed by a program of the same width: a wider one adds in another order. A
+device that has v = V / D shards computes them one after another. What crosses shards is gathered,
+which moves numbers and adds none, and then added in the order of the shards on every device.
+
+With one shard, the whole batch, every function here is the plain call of its argument. With
+several, arrays of a device's shards are stacked, [v, ...], and the code runs inside
+`jax.shard_map` over a mesh with the axis `AXIS` if there are several devices.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from purerl.config import check_divides
+from purerl.types import Array, PyTree
+
+AXIS = "devices"
+
+
+class Shards(NamedTuple):
+    """How the batch is cut, and how many devices share it."""
+
+    number: int = 1  # V
+    devices: int = 1  # D
+
+    @property
+    def local(self) -> int:
+        """Shards of one device, v."""
+        return self.number // self.devices
+
+
+WHOLE = Shards()
+
+
+def check_sizes(shards: Shards, num_envs: int) -> None:
+    """Raises ValueError unless the devices divide the shards, and the shards the environments."""
+    if shards.number % shards.devices:
+        below = shards.number - shards.number % shards.devices
+        sizes = [str(size) for size in (1, below, below + shards.devices) if size]
+        raise ValueError(
+            f"num_shards = {shards.number} cannot be shared by {shards.devices} devices; "
+            f"num_shards could be {', '.join(dict.fromkeys(sizes))} (1: a single device is used), "
+            "or show fewer devices."
+        )
+    check_divides("num_envs", num_envs, "num_shards", shards.number)
+
+
+def each(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
+    """Returns `function` of each shard of this device, one after another, stacked [v, ...]."""
+    if shards.number == 1:
+        return function(*parts)
+
+    def alone(one: tuple[PyTree, ...]) -> PyTree:
+        # XLA inlines a loop of one trip; nothing may be fused into the shard's own computation.
+        return jax.lax.optimization_barrier(function(*jax.lax.optimization_barrier(one)))
+
+    return jax.lax.map(alone, parts)
+
+
+def move(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
+    """Like `each`, at once: only for functions that move numbers or count, exact at any width."""
+    return function(*parts) if shards.number == 1 else jax.vmap(function)(*parts)
+
+
+def total(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
+    """Returns the sum over all V shards of `function` of each, the same on every device."""
+    if shards.number == 1:
+        return function(*parts)
+    return jax.tree.map(add_in_order, gather(shards, each(shards, function, *parts)))
+
+
+def gather(shards: Shards, parts: PyTree) -> PyTree:
+    """Returns what all shards have [V, ...], from this device's [v, ...]; one message a dtype."""
+    if shards.devices == 1:
+        return parts
+    leaves, structure = jax.tree.flatten(parts)
+    gathered: list[Array] = [jnp.empty(0)] * len(leaves)
+    for dtype in dict.fromkeys(leaf.dtype for leaf in leaves):
+        places = [i for i, leaf in enumerate(leaves) if leaf.dtype == dtype]
+        rows = [leaves[i].reshape(shards.local, -1) for i in places]
+        everyone = jax.lax.all_gather(jnp.concatenate(rows, axis=1), AXIS, tiled=True)
+        ends = np.cumsum([row.shape[1] for row in rows])
+        for i, columns in zip(places, jnp.split(everyone, ends[:-1], axis=1), strict=True):
+            gathered[i] = columns.reshape(shards.number, *leaves[i].shape[1:])
+    return jax.tree.unflatten(structure, gathered)
+
+
+def add_in_order(x: Array) -> Array:
+    """Returns the sum over the first axis, [V, ...] -> [...], by halves: one fixed tree."""
+    while x.shape[0] > 1:
+        half = x.shape[0] // 2
+        x = jnp.concatenate([x[:half] + x[half : 2 * half], x[2 * half :]])
+    return x[0]
+
+
+def numbers(shards: Shards) -> Array:
+    """Returns the numbers of this device's shards among all, [v] int32."""
+    first = jax.lax.axis_index(AXIS) * shards.local if shards.devices > 1 else 0
+    return jnp.arange(shards.local) + first

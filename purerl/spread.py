@@ -1,0 +1,263 @@
+"""Training on several devices: V shards of the environments, shared by D devices.
+
+Two programs make an update. `collect` acts in one shard. It is a program of one device, the very
+same on each and called once for each shard, because a partitioned program's physics has other bits
+than an unpartitioned one's (measured: MJX with contacts). `improve` learns, all devices together.
+Initialisation and evaluation are programs of one device too.
+"""
+
+import functools
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
+
+from purerl import ppo
+from purerl.config import Config
+from purerl.deterministic import list_scatter_sums
+from purerl.env import Env
+from purerl.evaluation import evaluate_in_run
+from purerl.experiment import Evaluation
+from purerl.shards import AXIS, Shards
+from purerl.train import Programs
+from purerl.types import Array, Metrics, Network, PyTree, TrainState
+
+PLACES = ("env", "carry", "episode", "discounted_return")  # fields of TrainState that are [B, ...]
+SAME = PartitionSpec()  # a copy on every device
+SPLIT = PartitionSpec(AXIS)
+
+
+class Spread(NamedTuple):
+    """A TrainState on its devices; environments by shard, of this process's devices only."""
+
+    learned: TrainState  # without PLACES; a copy on every device
+    places: tuple[dict[str, PyTree], ...]  # of each shard, on its device
+
+    @property
+    def params(self) -> PyTree:
+        """The parameters."""
+        return self.learned.params
+
+    @property
+    def steps(self) -> PyTree:
+        """Control steps taken."""
+        return self.learned.steps
+
+
+class Layout(NamedTuple):
+    """Which device computes which shards."""
+
+    shards: Shards
+    size: int  # environments in a shard
+    mesh: Mesh
+
+    @property
+    def here(self) -> list[tuple[Any, range]]:
+        """This process's devices, each with the numbers of its shards."""
+        local = self.shards.local
+        return [
+            (device, range(i * local, (i + 1) * local))
+            for i, device in enumerate(self.mesh.devices)
+            if device.process_index == jax.process_index()
+        ]
+
+
+def make_layout(shards: Shards, num_envs: int) -> Layout:
+    """Lays shards out over the first D devices, in JAX's order."""
+    devices = np.array(jax.devices()[: shards.devices])
+    mesh = Mesh(devices, (AXIS,), axis_types=(AxisType.Auto,))
+    return Layout(shards, num_envs // shards.number, mesh)
+
+
+# --- arrays ---
+
+
+def on(device: Any, tree: PyTree) -> PyTree:
+    """Returns the part of arrays of all devices that is on `device`, without a copy."""
+
+    def one(x: Array) -> Array:
+        return next(s.data for s in x.addressable_shards if s.device == device)
+
+    return jax.tree.map(one, tree)
+
+
+def assemble(layout: Layout, spec: PartitionSpec, trees: Sequence[PyTree]) -> PyTree:
+    """Makes arrays of all devices out of those of each device here, without a copy."""
+    sharding = NamedSharding(layout.mesh, spec)
+    factor = layout.shards.devices if spec == SPLIT else 1
+
+    def one(*parts: Array) -> Array:
+        shape = parts[0].shape
+        if spec == SPLIT:
+            shape = (shape[0] * factor, *shape[1:])
+        return jax.make_array_from_single_device_arrays(shape, sharding, list(parts))
+
+    return jax.tree.map(one, *trees)
+
+
+@jax.jit
+def join(trees: Sequence[PyTree]) -> PyTree:
+    """Concatenates trees of one device along the first axis."""
+    if len(trees) == 1:
+        return trees[0]
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *trees)
+
+
+def spread(layout: Layout, state: TrainState) -> Spread:
+    """Lays a state of one device, or of the host, out over the devices."""
+    places = {name: getattr(state, name) for name in PLACES}
+    learned = state.replace(**dict.fromkeys(PLACES))
+    size, parts = layout.size, []
+    for device, numbers in layout.here:
+        for i in numbers:
+            part = jax.tree.map(lambda x, i=i: x[i * size : (i + 1) * size], places)
+            parts.append(jax.device_put(part, device))
+    copies = [jax.device_put(learned, device) for device, _ in layout.here]
+    return Spread(assemble(layout, SAME, copies), tuple(parts))
+
+
+def fetch(layout: Layout, state: Spread) -> TrainState:
+    """Returns the whole state on one device; all processes take part, and all get it."""
+    local = layout.shards.local
+    groups = [state.places[i : i + local] for i in range(0, len(state.places), local)]
+    places = assemble(layout, SPLIT, [join(group) for group in groups])
+    same = jax.jit(lambda x: x, out_shardings=NamedSharding(layout.mesh, SAME))
+    device = layout.here[0][0]
+    return on(device, state.learned).replace(**on(device, same(places)))
+
+
+# --- programs ---
+
+
+def collect(
+    config: Config, env: Env, network: Network, learned: TrainState, places: dict, first: Array
+) -> tuple[dict[str, PyTree], ppo.Experience]:
+    """Moves one shard on; returns its places and, stacked [1, ...], what it saw."""
+    state, experience = ppo.collect(config, env, network, learned.replace(**places), first)
+    places = {name: getattr(state, name) for name in PLACES}
+    return places, jax.tree.map(lambda x: x[None], experience)
+
+
+def update(
+    layout: Layout, collects: Sequence[Callable], improve: Callable, state: Spread
+) -> tuple[Spread, Metrics]:
+    """One update; returns as soon as the devices have been told."""
+    shards, places, experience = iter(state.places), [], []
+    for (device, numbers), program in zip(layout.here, collects, strict=True):
+        learned, seen = on(device, state.learned), []
+        for i in numbers:
+            place, part = program(learned, next(shards), np.int32(i * layout.size))
+            places.append(place)
+            seen.append(part)
+        experience.append(join(seen))
+    learned, metrics = improve(state.learned, assemble(layout, SPLIT, experience))
+    return Spread(learned, tuple(places)), metrics
+
+
+def compile_programs(
+    config: Config,
+    env: Env,
+    network: Network,
+    evaluation: Evaluation,
+    fresh: bool,
+    shards: Shards,
+) -> Programs:
+    """Compiles what a run on several shards calls, as `train.compile_programs` does for one."""
+    layout = make_layout(shards, config.num_envs)
+    init = functools.partial(ppo.init, config, env, network)
+    key = jax.random.key(0)
+    abstract = jax.eval_shape(init, key)
+    learned = abstract.replace(**dict.fromkeys(PLACES))
+    seconds: dict[str, float] = {}
+
+    start = time.perf_counter()
+    collects, experience, unordered = compile_collects(layout, config, env, network, abstract)
+    improve = jax.jit(
+        jax.shard_map(
+            functools.partial(ppo.improve, config, network, shards=shards),
+            mesh=layout.mesh, in_specs=(SAME, SPLIT), out_specs=SAME, check_vma=False,
+        )
+    )  # fmt: skip
+    whole = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((shards.number, *x.shape[1:]), x.dtype), experience
+    )
+    mesh = layout.mesh
+    traced = improve.trace(
+        _placed(learned, NamedSharding(mesh, SAME)), _placed(whole, NamedSharding(mesh, SPLIT))
+    )
+    improve = traced.lower().compile()
+    seconds["update"] = time.perf_counter() - start
+
+    device = layout.here[0][0]
+    judge: Any = jax.jit(
+        functools.partial(judge_policy, config, env, network, evaluation.num_episodes, abstract)
+    )
+    if evaluation.number:
+        start = time.perf_counter()
+        judge = judge.lower(_placed(learned, SingleDeviceSharding(device))).compile()
+        seconds["evaluation"] = time.perf_counter() - start
+    make: Any = jax.jit(init)
+    if fresh:
+        start = time.perf_counter()
+        make = make.lower(key).compile()
+        seconds["init"] = time.perf_counter() - start
+    return Programs(
+        init=make,
+        update=functools.partial(update, layout, collects, improve),
+        evaluate=lambda state: judge(on(device, state.learned)),
+        seconds=seconds,
+        unordered=sorted({*unordered, *_unordered(traced)}),
+        spread=functools.partial(spread, layout),
+        fetch=functools.partial(fetch, layout),
+    )
+
+
+def compile_collects(
+    layout: Layout, config: Config, env: Env, network: Network, abstract: TrainState
+) -> tuple[list[Callable], PyTree, list[str]]:
+    """Compiles `collect` for each device here; returns what it collects too, and unordered sums."""
+    program = jax.jit(functools.partial(collect, config, env, network), donate_argnums=1)
+    learned = abstract.replace(**dict.fromkeys(PLACES))
+    places = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((layout.size, *x.shape[1:]), x.dtype),
+        {name: getattr(abstract, name) for name in PLACES},
+    )
+    first = jax.ShapeDtypeStruct((), jnp.int32)
+
+    def build(device: Any) -> Any:
+        here = SingleDeviceSharding(device)
+        return program.lower(*_placed((learned, places, first), here)).compile()
+
+    (device, _), *others = layout.here
+    # The first alone: where the persistent cache serves all devices, the others find it there.
+    compiled = [build(device)]
+    with ThreadPoolExecutor() as pool:
+        compiled += pool.map(build, [device for device, _ in others])
+    traced = program.trace(learned, places, first)
+    return compiled, traced.out_info[1], _unordered(traced)
+
+
+def judge_policy(
+    config: Config,
+    env: Env,
+    network: Network,
+    num_episodes: int,
+    abstract: TrainState,
+    learned: TrainState,
+) -> Metrics:
+    """Evaluates on one device, whatever their number."""
+    carry = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), abstract.carry)
+    return evaluate_in_run(config, env, network, num_episodes, learned.replace(carry=carry))
+
+
+def _placed(tree: PyTree, sharding: Any) -> PyTree:
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), tree)
+
+
+def _unordered(traced: Any) -> list[str]:
+    return [f"{s.primitive} at {s.source}" for s in list_scatter_sums(traced.jaxpr)]
