@@ -8,6 +8,7 @@ first start finds an empty compilation cache, the second one the cache that the 
 """
 
 import argparse
+import os
 import re
 import subprocess
 import sys
@@ -28,6 +29,7 @@ class Start(NamedTuple):
     planned: float  # imports done, environment and network built, the plan printed
     compiled: float
     first_update: float
+    cpu: float  # processor time until then: what the start would take alone, on one core
     compile_times: dict[str, float]  # as the run reports them [s]
 
 
@@ -43,7 +45,8 @@ def start(experiment: str, engine: str, overrides: list[str], cache: Path, state
         words = command(experiment, engine, overrides, Path(folder))
         begin = time.perf_counter()
         process = subprocess.Popen(
-            ["env", f"JAX_COMPILATION_CACHE_DIR={cache}", *words],
+            words,
+            env=os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache)},
             stdout=(Path(folder) / "output").open("w"),
             stderr=subprocess.STDOUT,
         )
@@ -71,7 +74,15 @@ def watch(process: subprocess.Popen, folder: Path, begin: float) -> Start:
         seen = {name: now for name, done in written.items() if done} | seen
         if process.poll() is not None or now > LIMIT_S:
             raise RuntimeError(f"The run ended, or took {LIMIT_S:.0f} s, before its update: {text}")
-    return Start("", "", "", seen["plan"], seen["compiled"], seen["update"], compile_times(text))
+    times = seen["plan"], seen["compiled"], seen["update"], cpu_seconds(process.pid)
+    return Start("", "", "", *times, compile_times(text))
+
+
+def cpu_seconds(process_id: int) -> float:
+    """Returns the processor time that a process has taken [s], from Linux's /proc."""
+    # The second field is the command in brackets, and may hold spaces.
+    fields = Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def compile_times(output: str) -> dict[str, float]:
@@ -103,14 +114,15 @@ def help_seconds() -> float:
 def table(starts: list[Start]) -> str:
     """Formats starts; the last column is what the run says of its compiling."""
     lines = [
-        "| experiment | engine | cache | plan [s] | compiled [s] | first update [s] | of which |"
+        "| experiment | engine | cache | plan [s] | compiled [s] | first update [s] | CPU [s] "
+        "| of which |"
     ]
-    lines.append("|---|---|---|---|---|---|---|")
+    lines.append("|---|---|---|---|---|---|---|---|")
     for s in starts:
         parts = ", ".join(f"{name} {seconds:.1f}" for name, seconds in s.compile_times.items())
         lines.append(
             f"| {s.experiment} | {s.engine} | {s.cache} | {s.planned:.1f} | {s.compiled:.1f} "
-            f"| {s.first_update:.1f} | {parts} |"
+            f"| {s.first_update:.1f} | {s.cpu:.1f} | {parts} |"
         )
     return "\n".join(lines)
 

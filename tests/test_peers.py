@@ -100,3 +100,34 @@ def test_both_trainers_learn_with_equal_sizes():
     params = built.init(jax.random.key(0))[0]
     number = sum(x.size for x in jax.tree.leaves(params))
     assert number == sum(p.numel() for p in model.policy.parameters())
+
+
+def test_braxs_environment_keeps_to_the_protocol_and_steps_as_braxs():
+    """Its states through our record and back are the states that brax steps through itself."""
+    pytest.importorskip("brax", reason="needs the extra peers")
+    from envs import brax_env
+
+    env = brax_env.build(brax_env.Options(backend="positional"))  # the quickest to compile
+    check_env(env)
+    key, step = jax.random.key(0), jax.jit(env.step)
+    ours, theirs = jax.jit(env.reset)(jax.random.clone(key)), jax.jit(env.env.reset)(key)
+    their_step = jax.jit(env.env.step)
+    for i in range(10):
+        action = jnp.full(env.action_size, (-1.0) ** i)
+        ours, theirs = step(ours, action), their_step(theirs, action)
+        np.testing.assert_allclose(ours.observation, theirs.obs, atol=1e-5)
+        np.testing.assert_allclose(ours.reward, theirs.reward, atol=1e-5)
+        assert bool(ours.terminated) == bool(theirs.done)
+
+
+@pytest.mark.parametrize("body", ["ant", "humanoid", "halfcheetah"])
+def test_braxs_settings_make_the_same_update(body):
+    """As many samples, of as many environments, in minibatches of the same size."""
+    from experiments import brax_peer
+
+    sizes = brax_peer.BODIES[body]
+    config = brax_peer.our_experiment(body, "mjx", sizes, 10**8).ppo
+    assert config.samples_per_update == sizes.samples
+    assert sizes.batch_size * sizes.num_minibatches % sizes.num_envs == 0  # brax's own rule
+    minibatch = config.samples_per_update // config.num_minibatches
+    assert minibatch == sizes.batch_size * sizes.unroll_length
