@@ -122,18 +122,18 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--engine", default="auto")
     parser.add_argument("--csv", default="", help="also write the points to this file")
     options = parser.parse_args(arguments)
+    seeds = find(options.seeds_experiment).experiment
     experiment = find(options.experiment).experiment
     rows = []
-    for axis in options.axes:
-        for value in AXES[axis]:
-            if axis == "seeds":
-                seeds = find(options.seeds_experiment).experiment
-                rows.append(seeds_point(seeds, options.engine, value))
-            else:
-                rows.append(point(experiment, options.experiment, options.engine, axis, value))
+    for axis, value in [(name, value) for name in options.axes for value in AXES[name]]:
+        if axis == "seeds":
+            rows.append(seeds_point(seeds, options.engine, value))
+        else:
+            rows.append(point(experiment, options.experiment, options.engine, axis, value))
+        print(table(rows).splitlines()[-1], flush=True)
+        if options.csv:  # as they come: a whole table takes minutes
+            write(Path(options.csv), rows)
     print(table(rows))
-    if options.csv:
-        write(Path(options.csv), rows)
     return 0
 
 
