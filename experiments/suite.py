@@ -17,6 +17,7 @@ experiment = Experiment(
         num_steps=3_000_000,
         num_envs=128,
         rollout_length=64,
+        reset_pool=16,  # 8 of the 128 episodes of 1000 steps end in an update
         num_epochs=4,
         num_minibatches=8,
         learning_rate=3e-4,

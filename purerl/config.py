@@ -50,8 +50,9 @@ class Config:
     """Factor on every reward before learning; reported returns are unscaled."""
     distribution: Literal["normal", "tanh_normal"] = "tanh_normal"
     """Family of the policy."""
-    resets_per_update: int = 1
-    """Fresh starts drawn for each environment in each update; one that ends more often replays."""
+    reset_pool: int = 0
+    """Fresh starts drawn in each update: a multiple of num_envs, or a part of it that environments
+    share (where episodes are long and starts are dear); 0: one for each environment."""
 
     def __post_init__(self) -> None:
         """Raises ValueError for a number outside its range or a budget below one update."""
@@ -65,6 +66,7 @@ class Config:
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be above 0.")
         _check_budget(self)
+        check_pool(self)
 
     @property
     def samples_per_update(self) -> int:
@@ -94,7 +96,6 @@ _POSITIVE_INTEGERS = (
     "num_minibatches",
     "episode_length",
     "action_repeat",
-    "resets_per_update",
 )
 
 
@@ -103,6 +104,16 @@ def _check_budget(config: Config) -> None:
         raise ValueError(
             f"num_steps is {config.num_steps}, less than one update of num_envs * rollout_length * "
             f"action_repeat = {config.steps_per_update}; raise num_steps or lower one of the three."
+        )
+
+
+def check_pool(config: Config) -> None:
+    """Raises ValueError unless each environment has as many starts of its own, or shares one."""
+    pool, size = config.reset_pool, config.num_envs
+    if pool < 0 or (pool and pool % size and size % pool):
+        raise ValueError(
+            f"reset_pool is {pool}; with num_envs = {size} it must be 0, a multiple of {size} or a "
+            "divisor of it."
         )
 
 

@@ -18,7 +18,7 @@ from purerl import losses, normalizer
 from purerl.config import Config, check_divides
 from purerl.env import Env
 from purerl.keys import Purpose, derive, per_environment
-from purerl.rollout import Finished, Transition, rollout, start_episodes
+from purerl.rollout import Finished, Transition, count_replays, rollout, start_episodes
 from purerl.shards import WHOLE, Shards, gather, move, numbers, total
 from purerl.targets import Batch, make_batch
 from purerl.types import (
@@ -357,7 +357,6 @@ def next_rate(config: Config, rate: Array, kl: Array, sound: Array) -> Array:
 def rollout_sums(config: Config, transitions: Transition, finished: Finished) -> Metrics:
     """Adds up what `rollout_metrics` needs over a rollout's steps and environments."""
     valid = transitions.valid.astype(jnp.float32)
-    replayed = jnp.maximum(finished.resets - config.resets_per_update, 0)
     return {
         "reward": (valid * transitions.reward).sum(),
         "valid": valid.sum(),
@@ -365,7 +364,7 @@ def rollout_sums(config: Config, transitions: Transition, finished: Finished) ->
         "episode_return": finished.episode_return.sum(),
         "episode_length": finished.length.sum(),
         "nonfinite_resets": finished.nonfinite_resets.sum().astype(jnp.float32),
-        "replayed_resets": replayed.sum().astype(jnp.float32),
+        "replayed_resets": count_replays(config, finished.resets).astype(jnp.float32),
         **{f"episode/{name}": x.sum() for name, x in finished.metrics.items()},
     }
 

@@ -25,7 +25,7 @@ CONFIG = ppo.Config(
     episode_length=LENGTH,
     gamma=0.9,
     learning_rate=1e-2,
-    resets_per_update=3,
+    reset_pool=18,
 )
 
 
@@ -130,12 +130,33 @@ def test_every_start_is_fresh():
 
 
 def test_replayed_starts_are_counted():
-    config = dataclasses.replace(CONFIG, resets_per_update=1)
+    config = dataclasses.replace(CONFIG, reset_pool=6)
     env, network, state = setup(config)
     _, transitions, finished, _ = ROLLOUT(config, env, network, state)
     _, metrics = UPDATE(config, env, network, state)
     ends = np.asarray(transitions.done).sum(0)
     assert metrics["replayed_resets"] == np.maximum(ends - 1, 0).sum() > 0
+
+
+def test_a_shared_pool_gives_each_start_to_several_environments():
+    config = dataclasses.replace(CONFIG, reset_pool=2, num_envs=6)
+    env, network, state = setup(config)
+    _, transitions, _, _ = ROLLOUT(config, env, network, state)
+    _, metrics = UPDATE(config, env, network, state)
+    done = np.asarray(transitions.done)
+    begins = np.asarray(transitions.observation)[1:][done[:-1]][:, 0]
+    places = np.nonzero(done[:-1])[1]
+    for parity in (0, 1):
+        assert len(set(begins[places % 2 == parity].tolist())) == 1
+    assert len(set(begins.tolist())) == 2
+    ends = done.sum(0)
+    assert metrics["replayed_resets"] == sum(ends[p::2].sum() - 1 for p in (0, 1)) > 0
+
+
+@pytest.mark.parametrize("pool", [-1, 4, 9])
+def test_a_pool_that_cannot_be_shared_evenly_is_refused(pool):
+    with pytest.raises(ValueError, match=f"reset_pool is {pool}; with num_envs = 6"):
+        dataclasses.replace(CONFIG, reset_pool=pool)
 
 
 def slow_batch(transitions, last_value, observations_before_reset, value_of, gamma, lambda_):
