@@ -107,7 +107,7 @@ def save(folder: Path, leaves: Leaves, meta: dict[str, Any]) -> Path:
     discard(path)
     stored = {key: array for key, array in leaves.items() if array.size}
     try:
-        with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
+        with _checkpointer() as checkpointer:
             checkpointer.save(
                 path.absolute(),
                 ocp.args.Composite(
@@ -136,7 +136,7 @@ def load(path: Path, abstract: PyTree) -> Saved:
     leaves = {key: _blank(about) for key, about in meta["leaves"].items()}
     target = {key: array for key, array in leaves.items() if array.size}
     try:
-        with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
+        with _checkpointer() as checkpointer:
             arguments = ocp.args.Composite(state=ocp.args.StandardRestore(target))
             leaves |= checkpointer.restore(path.absolute(), arguments).state
     except Exception as error:  # Orbax raises many kinds for broken files, none of them its own
@@ -319,6 +319,22 @@ def _flush(path: Path) -> None:
             os.fsync(handle)
         finally:
             os.close(handle)
+
+
+def _checkpointer() -> Any:
+    """Returns what saves and loads; of several processes the first does, without the others."""
+    ocp = _orbax()
+    if jax.process_count() == 1:
+        return ocp.Checkpointer(ocp.CompositeCheckpointHandler())
+    alone = ocp.options.MultiprocessingOptions(
+        primary_host=0, active_processes={0}, barrier_sync_key_prefix="first"
+    )
+    handler = ocp.CompositeCheckpointHandler(
+        state=ocp.StandardCheckpointHandler(multiprocessing_options=alone),
+        meta=ocp.JsonCheckpointHandler(multiprocessing_options=alone),
+        composite_options=ocp.CompositeOptions(multiprocessing_options=alone),
+    )
+    return ocp.Checkpointer(handler, multiprocessing_options=alone)
 
 
 def _orbax() -> Any:

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from purerl import checkpoint, console, kernels, manifest, ppo, rundir, spread, train
+from purerl import checkpoint, console, distributed, kernels, manifest, ppo, rundir, spread, train
+from purerl.distributed import alone
 from purerl.errors import RunError, UserError
 from purerl.experiment import Experiment, Source
 from purerl.loggers import BackgroundLogger, Say, TensorBoardSink, WandbSink, check_installed
@@ -46,11 +47,12 @@ def execute(
       stack: closes what is opened here.
     """
     chosen, vmapped = next(iter(runs.values())), vmapped_seeds(options)
-    rundir.check_new_or_resume(runs, options.resume)
+    distributed.start(options.distributed)
+    alone(lambda: rundir.check_new_or_resume(runs, options.resume))
     loggers = needed_loggers(options)
     cache = set_up_jax(options.cache)
     setup = rundir.build(chosen)
-    shards = choose_shards(setup, runs, options)
+    shards = choose_shards(setup, options, alone(lambda: shards_on_disk(runs)))
     plan = train.make_plan(setup.config, chosen.evaluation, options.checkpoints, options.log_every)
     schedule = {"log_every": plan.log_every, "checkpoints": options.checkpoints}
     platform = jax.default_backend()
@@ -59,17 +61,20 @@ def execute(
     facts = manifest.collect(setup.engine, builders, chosen_by, shards.number)
     if vmapped > 1:  # part of what the bits depend on
         facts["vmapped_seeds"] = {"first": chosen.seed, "number": vmapped}
-    for folder in runs:
-        stack.enter_context(rundir.lock(folder))
-    rundir.check_new_or_resume(runs, options.resume)  # again: another process may have been here
-    for folder, one in runs.items():
-        settings = rundir.describe(source, one, schedule)
-        begin_or_go_on(folder, source, settings, facts, options.allow_changes)
-    abstract = train.abstract_state(*setup[:3])
-    lines = console.describe_plan(plan, setup, abstract, facts, list(runs), cache)
-    print("\n".join(lines), flush=True)
 
-    fresh = not all(any((folder / "checkpoints").glob("*")) for folder in runs)
+    def prepare() -> bool:
+        for folder in runs:
+            stack.enter_context(rundir.lock(folder))
+        rundir.check_new_or_resume(runs, options.resume)  # again: another may have been here
+        for folder, one in runs.items():
+            settings = rundir.describe(source, one, schedule)
+            begin_or_go_on(folder, source, settings, facts, options.allow_changes)
+        lines = console.describe_plan(plan, setup, abstract, facts, list(runs), cache)
+        print("\n".join(lines), flush=True)
+        return not all(any((folder / "checkpoints").glob("*")) for folder in runs)
+
+    abstract = train.abstract_state(*setup[:3])
+    fresh = alone(prepare)
 
     @functools.cache
     def programs() -> train.Programs:
@@ -77,7 +82,7 @@ def execute(
             made = spread.compile_programs(*setup[:3], chosen.evaluation, fresh, shards)
         else:
             made = train.compile_programs(*setup[:3], chosen.evaluation, fresh, vmapped)
-        if platform == "gpu":
+        if platform == "gpu" and distributed.is_first():
             reasons = manifest.inexact_because(setup.engine, chosen_by, made.unordered)
             for folder in runs:
                 rundir.amend(folder, manifest.exactness(reasons))
@@ -95,16 +100,19 @@ def execute(
         raise RunError(" ".join(failed))
 
 
-def choose_shards(setup: rundir.Setup, folders: Iterable[Path], options: "Options") -> Shards:
+def shards_on_disk(folders: Iterable[Path]) -> int:
+    """Returns how many shards a run was begun with, 0 if there is none yet."""
+    begun = [folder for folder in folders if (folder / "config.json").exists()]
+    return rundir.read_json(begun[0] / "manifest.json").get("num_shards", 1) if begun else 0
+
+
+def choose_shards(setup: rundir.Setup, options: "Options", begun_with: int) -> Shards:
     """Returns the shards asked for, or those of the run that goes on, or one for each device.
 
     Raises:
       UserError: devices, shards, environments and minibatches do not divide as they must.
     """
-    begun = [folder for folder in folders if (folder / "config.json").exists()]
-    number, devices = options.num_shards, jax.device_count()
-    if not number and begun:
-        number = rundir.read_json(begun[0] / "manifest.json").get("num_shards", 1)
+    number, devices = options.num_shards or begun_with, jax.device_count()
     if vmapped_seeds(options) > 1:
         if number > 1:
             raise UserError(
@@ -113,6 +121,12 @@ def choose_shards(setup: rundir.Setup, folders: Iterable[Path], options: "Option
             )
         number = 1
     number = number or devices
+    if number == 1 and jax.process_count() > 1:
+        raise UserError(
+            f"num_shards is 1, which one device computes, and there are {jax.process_count()} "
+            f"processes with {devices} devices; leave out --distributed, or cut the environments "
+            f"with --num-shards {devices}."
+        )
     shards = Shards(number, devices if number > 1 else 1)
     try:
         check_sizes(shards, setup.config.num_envs)
@@ -139,23 +153,37 @@ def train_together(
     stop: Callable[[], bool],
 ) -> None:
     """Trains one run, or vmapped ones, from the newest checkpoint that all of them have."""
-    with console.progress(plan.updates) as progress, ExitStack() as stack:
+    with ExitStack() as stack:
+        progress: Any = distributed.Silent()
+        if distributed.is_first():
+            progress = stack.enter_context(console.progress(plan.updates))
         places = [folder / "checkpoints" for folder in folders]
-        saved = checkpoint.newest_of_all(places, abstract, progress.say)
-        if saved and saved[0].meta["update"] >= plan.updates:
+        saved: list[checkpoint.Saved] = []
+
+        def find() -> dict[str, Any]:
+            saved.extend(checkpoint.newest_of_all(places, abstract, progress.say))
+            known = saved[0].meta if saved else {"wall_s": 0.0, "update": 0}
+            return {name: known[name] for name in ("wall_s", "update")} | {"found": bool(saved)}
+
+        meta = alone(find)
+        if meta["update"] >= plan.updates:
             for one in saved:
                 progress.say(f"Already done: {plan.updates} updates. Digest {one.meta['digest']}")
             return
         seconds = programs().seconds
         times = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items())
         progress.say(f"Compiled: {times}")
-        state, meta = first_state(saved, seeds, programs(), progress.say)
-        recorders = open_recorders(folders, saved, options, progress.say)
-        for folder, recorder in zip(folders, recorders, strict=True):
-            stack.callback(recorder.close)
-            recorder.loggers = [start(folder, meta["update"], progress.say) for start in loggers]
-        if options.video:  # of the first seed: one such process is enough
-            recorders[0].loggers.append(RunVideo(folders[0], stop, progress.say))
+        state = first_state(meta.pop("found"), saved, seeds, programs(), abstract, progress.say)
+        recorders: list[Any] = [distributed.Silent(folder) for folder in folders]
+        if distributed.is_first():
+            recorders = open_recorders(folders, saved, options, progress.say)
+            for folder, recorder in zip(folders, recorders, strict=True):
+                stack.callback(recorder.close)
+                recorder.loggers = [
+                    begin(folder, meta["update"], progress.say) for begin in loggers
+                ]
+            if options.video:  # of the first seed: one such process is enough
+                recorders[0].loggers.append(RunVideo(folders[0], stop, progress.say))
         meta["fingerprint"] = manifest.fingerprint(facts)
         train.train(
             plan,
@@ -163,7 +191,7 @@ def train_together(
             programs().spread(state),
             recorders,
             progress,
-            stop,
+            distributed.agreed(stop),
             progress.say,
             meta,
         )
@@ -173,20 +201,24 @@ def train_together(
 
 
 def first_state(
-    saved: list[checkpoint.Saved], seeds: list[int], programs: train.Programs, say: Say
-) -> tuple[TrainState, dict[str, Any]]:
-    """Returns the state to begin with, and what is known of earlier lives."""
+    found: bool,
+    saved: list[checkpoint.Saved],
+    seeds: list[int],
+    programs: train.Programs,
+    abstract: PyTree,
+    say: Say,
+) -> TrainState:
+    """Returns the state to begin with: new, or the `saved` one that the first process has found."""
 
     def together(trees: list[Any]) -> Any:
         return trees[0] if len(trees) == 1 else jax.tree.map(lambda *x: jnp.stack(x), *trees)
 
-    if not saved:
-        keys = together([jax.random.key(seed) for seed in seeds])
-        return programs.init(keys), {"wall_s": 0.0, "update": 0}
+    if not found:
+        return programs.init(together([jax.random.key(seed) for seed in seeds]))
     for one in saved:
         say(f"Resuming after update {one.meta['update']}. Digest {one.meta['digest']}")
-    known = {name: saved[0].meta[name] for name in ("wall_s", "update")}
-    return together([one.state for one in saved]), known
+    state = together([one.state for one in saved]) if saved else None
+    return distributed.state_of_first(state, abstract)
 
 
 def open_recorders(

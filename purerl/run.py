@@ -42,6 +42,9 @@ class Options:
     num_shards: int = 0
     """Cut the environments into this many parts, a multiple of the devices that share them: on any
     number of devices the bits are the same. 0: a part for each device; 1: use one device."""
+    distributed: str = ""
+    """One of several processes that train together: auto (SLURM, Open MPI, ...), or
+    HOST:PORT,NUM_PROCESSES,PROCESS_ID, HOST being that of process 0, which alone writes the run."""
     resume: bool = False
     """Go on from the last whole checkpoint of the run."""
     allow_changes: bool = False
@@ -110,6 +113,7 @@ def command(arguments: Sequence[str]) -> None:
     """Parses, prepares and trains."""
     kernels.fix_choice()  # before JAX starts
     from purerl.cli import parse
+    from purerl.distributed import fail_together
     from purerl.launch import execute
 
     if arguments[0].startswith("-"):
@@ -122,6 +126,7 @@ def command(arguments: Sequence[str]) -> None:
     chosen, options = from_command_line(parse, source, arguments[1:], prog)
     with ExitStack() as stack:
         stop = stack.enter_context(stop_signals())
+        stack.enter_context(fail_together())
         execute(source, runs_of(source, chosen, options), options, stop, stack)
 
 

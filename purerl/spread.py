@@ -108,6 +108,18 @@ def join(trees: Sequence[PyTree]) -> PyTree:
     return jax.tree.map(lambda *x: jnp.concatenate(x), *trees)
 
 
+@functools.partial(jax.jit, static_argnums=2)
+def cut(places: PyTree, first: Array, size: int) -> PyTree:
+    """Returns the environments from number `first` on."""
+    return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, size), places)
+
+
+@functools.cache
+def gather_all(mesh: Mesh) -> Callable[[PyTree], PyTree]:
+    """Returns a program that copies what is spread to every device."""
+    return jax.jit(lambda x: x, out_shardings=NamedSharding(mesh, SAME))
+
+
 def spread(layout: Layout, state: TrainState) -> Spread:
     """Lays a state of one device, or of the host, out over the devices."""
     places = {name: getattr(state, name) for name in PLACES}
@@ -115,8 +127,7 @@ def spread(layout: Layout, state: TrainState) -> Spread:
     size, parts = layout.size, []
     for device, numbers in layout.here:
         for i in numbers:
-            part = jax.tree.map(lambda x, i=i: x[i * size : (i + 1) * size], places)
-            parts.append(jax.device_put(part, device))
+            parts.append(jax.device_put(cut(places, np.int32(i * size), size), device))
     copies = [jax.device_put(learned, device) for device, _ in layout.here]
     return Spread(assemble(layout, SAME, copies), tuple(parts))
 
@@ -126,9 +137,9 @@ def fetch(layout: Layout, state: Spread) -> TrainState:
     local = layout.shards.local
     groups = [state.places[i : i + local] for i in range(0, len(state.places), local)]
     places = assemble(layout, SPLIT, [join(group) for group in groups])
-    same = jax.jit(lambda x: x, out_shardings=NamedSharding(layout.mesh, SAME))
     device = layout.here[0][0]
-    return on(device, state.learned).replace(**on(device, same(places)))
+    everywhere = gather_all(layout.mesh)(places)
+    return on(device, state.learned).replace(**on(device, everywhere))
 
 
 # --- programs ---

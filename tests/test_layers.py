@@ -13,6 +13,7 @@ EFFECTS = {
     "cli",
     "compare",
     "console",
+    "distributed",
     "errors",
     "evaluate",
     "experiment",
