@@ -242,6 +242,8 @@ def shuffle(key: Array, columns: int, minibatches: int, shards: Shards) -> Array
 
 def scheduled_rate(config: Config, state: TrainState) -> Array:
     """Returns the learning rate that this update starts with, []."""
+    if config.schedule == "constant":  # as set now, which a resumed run may have changed
+        return jnp.asarray(config.learning_rate, jnp.float32)
     if config.schedule == "linear":
         progress = state.update.astype(jnp.float32) / config.num_updates
         return config.learning_rate * (1.0 - progress)

@@ -159,6 +159,16 @@ def test_a_pool_that_cannot_be_shared_evenly_is_refused(pool):
         dataclasses.replace(CONFIG, reset_pool=pool)
 
 
+@pytest.mark.parametrize(
+    "schedule, update, rate", [("constant", 3, 0.5), ("linear", 25, 0.375), ("adaptive_kl", 3, 0.1)]
+)
+def test_where_the_learning_rate_of_an_update_comes_from(schedule, update, rate):
+    """100 updates; 0.5 is the setting, 0.1 what the state was left with."""
+    config = dataclasses.replace(CONFIG, schedule=schedule, learning_rate=0.5)
+    state = setup()[2].replace(learning_rate=jnp.float32(0.1), update=jnp.int32(update))
+    assert ppo.scheduled_rate(config, state) == pytest.approx(rate)
+
+
 def slow_batch(transitions, last_value, observations_before_reset, value_of, gamma, lambda_):
     """Advantages, one step at a time, with V of the observation before each reset."""
     steps, size = transitions.reward.shape
