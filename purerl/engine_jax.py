@@ -112,8 +112,12 @@ def reading_shapes(model: mujoco.MjModel, names: tuple[str, ...]) -> dict[str, t
 
 
 def _jax_defaults() -> contextlib.ExitStack:
-    """MJX relies on implicit promotion: its tracing is exempt from a caller's stricter rules."""
+    """MJX relies on implicit promotion: its tracing is exempt from a caller's stricter rules.
+
+    Its matrix products are whole float32 ones: a GPU's default has 10 bits of mantissa (TF32).
+    """
     stack = contextlib.ExitStack()
+    stack.enter_context(jax.default_matmul_precision("highest"))
     stack.enter_context(jax.numpy_dtype_promotion("standard"))
     stack.enter_context(jax.numpy_rank_promotion("allow"))
     return stack
