@@ -16,7 +16,18 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from purerl import checkpoint, console, distributed, kernels, manifest, ppo, rundir, spread, train
+from purerl import (
+    checkpoint,
+    compilation,
+    console,
+    distributed,
+    kernels,
+    manifest,
+    ppo,
+    rundir,
+    spread,
+    train,
+)
 from purerl.distributed import alone
 from purerl.errors import RunError, UserError
 from purerl.experiment import Experiment, Source
@@ -73,15 +84,15 @@ def execute(
         print("\n".join(lines), flush=True)
         return not all(any((folder / "checkpoints").glob("*")) for folder in runs)
 
-    abstract = train.abstract_state(*setup[:3])
+    abstract = compilation.abstract_state(*setup[:3])
     fresh = alone(prepare)
 
     @functools.cache
-    def programs() -> train.Programs:
+    def programs() -> compilation.Programs:
         if shards.number > 1:
             made = spread.compile_programs(*setup[:3], chosen.evaluation, fresh, shards)
         else:
-            made = train.compile_programs(*setup[:3], chosen.evaluation, fresh, vmapped)
+            made = compilation.compile_programs(*setup[:3], chosen.evaluation, fresh, vmapped)
         if platform == "gpu" and distributed.is_first():
             reasons = manifest.inexact_because(setup.engine, chosen_by, made.unordered)
             for folder in runs:
@@ -130,7 +141,7 @@ def choose_shards(setup: rundir.Setup, options: "Options", begun_with: int) -> S
     shards = Shards(number, devices if number > 1 else 1)
     try:
         check_sizes(shards, setup.config.num_envs)
-        ppo.check_sizes(setup.config, train.abstract_state(*setup[:3]).carry, number)
+        ppo.check_sizes(setup.config, compilation.abstract_state(*setup[:3]).carry, number)
     except ValueError as error:
         raise UserError(str(error)) from error
     return shards
@@ -145,7 +156,7 @@ def train_together(
     folders: list[Path],
     seeds: list[int],
     plan: train.Plan,
-    programs: Callable[[], train.Programs],
+    programs: Callable[[], compilation.Programs],
     abstract: PyTree,
     facts: dict[str, Any],
     options: "Options",
@@ -204,7 +215,7 @@ def first_state(
     found: bool,
     saved: list[checkpoint.Saved],
     seeds: list[int],
-    programs: train.Programs,
+    programs: compilation.Programs,
     abstract: PyTree,
     say: Say,
 ) -> TrainState:

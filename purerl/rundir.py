@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-from purerl import checkpoint, experiment, manifest, train
+from purerl import checkpoint, compilation, experiment, manifest
 from purerl.config import Config
 from purerl.env import Env
 from purerl.errors import UserError, one_line
@@ -53,7 +53,9 @@ def build(chosen: Experiment) -> Setup:
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state.observation)
         network = chosen.build_network(chosen.network, zeros, env.action_size)
         setup = Setup(chosen.ppo, env, network, engine)
-        train.abstract_state(*setup[:3])  # sizes that do not fit together show here, in a second
+        compilation.abstract_state(
+            *setup[:3]
+        )  # sizes that do not fit together show here, in a second
     except (ValueError, ImportError) as error:
         raise UserError(one_line(error)) from error
     return setup
@@ -166,7 +168,7 @@ def restore(folder: Path, update: str, say: Say, engine: str = "") -> Run:
 
 
 def _choose(folder: Path, update: str, setup: Setup, say: Say) -> checkpoint.Saved:
-    abstract = train.abstract_state(*setup[:3])
+    abstract = compilation.abstract_state(*setup[:3])
     found = checkpoint.updates(folder)
     if update == "latest":
         saved = checkpoint.newest(folder, abstract, say, set_aside=False)

@@ -18,13 +18,12 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
 from purerl import ppo
+from purerl.compilation import Programs, start, unordered, when_ready
 from purerl.config import Config
-from purerl.deterministic import list_scatter_sums
 from purerl.env import Env
 from purerl.evaluation import evaluate_in_run
 from purerl.experiment import Evaluation
 from purerl.shards import AXIS, Shards
-from purerl.train import Programs
 from purerl.types import Array, Metrics, Network, PyTree, TrainState
 
 PLACES = ("env", "carry", "episode", "discounted_return")  # fields of TrainState that are [B, ...]
@@ -178,7 +177,7 @@ def compile_programs(
     fresh: bool,
     shards: Shards,
 ) -> Programs:
-    """Compiles what a run on several shards calls, as `train.compile_programs` does for one."""
+    """Compiles what a run on several shards calls, as `compilation` does for one device."""
     layout = make_layout(shards, config.num_envs)
     init = functools.partial(ppo.init, config, env, network)
     key = jax.random.key(0)
@@ -186,8 +185,8 @@ def compile_programs(
     learned = abstract.replace(**dict.fromkeys(PLACES))
     seconds: dict[str, float] = {}
 
-    start = time.perf_counter()
-    collects, experience, unordered = compile_collects(layout, config, env, network, abstract)
+    begin = time.perf_counter()
+    collects, experience, sums = compile_collects(layout, config, env, network, abstract)
     improve = jax.jit(
         jax.shard_map(
             functools.partial(ppo.improve, config, network, shards=shards),
@@ -201,28 +200,25 @@ def compile_programs(
     traced = improve.trace(
         _placed(learned, NamedSharding(mesh, SAME)), _placed(whole, NamedSharding(mesh, SPLIT))
     )
-    improve = traced.lower().compile()
-    seconds["update"] = time.perf_counter() - start
-
+    improving = start("update", traced, seconds)
     device = layout.here[0][0]
     judge: Any = jax.jit(
         functools.partial(judge_policy, config, env, network, evaluation.num_episodes, abstract)
     )
     if evaluation.number:
-        start = time.perf_counter()
-        judge = judge.lower(_placed(learned, SingleDeviceSharding(device))).compile()
-        seconds["evaluation"] = time.perf_counter() - start
+        here = _placed(learned, SingleDeviceSharding(device))
+        judge = when_ready(start("evaluation", judge.trace(here), seconds))
     make: Any = jax.jit(init)
     if fresh:
-        start = time.perf_counter()
-        make = make.lower(key).compile()
-        seconds["init"] = time.perf_counter() - start
+        make = start("init", make.trace(key), seconds).result()
+    improve = improving.result()
+    seconds["update"] = time.perf_counter() - begin
     return Programs(
         init=make,
         update=functools.partial(update, layout, collects, improve),
         evaluate=lambda state: judge(on(device, state.learned)),
         seconds=seconds,
-        unordered=sorted({*unordered, *_unordered(traced)}),
+        unordered=sorted({*sums, *unordered(traced)}),
         spread=functools.partial(spread, layout),
         fetch=functools.partial(fetch, layout),
     )
@@ -250,7 +246,7 @@ def compile_collects(
     with ThreadPoolExecutor() as pool:
         compiled += pool.map(build, [device for device, _ in others])
     traced = program.trace(learned, places, first)
-    return compiled, traced.out_info[1], _unordered(traced)
+    return compiled, traced.out_info[1], unordered(traced)
 
 
 def judge_policy(
@@ -268,7 +264,3 @@ def judge_policy(
 
 def _placed(tree: PyTree, sharding: Any) -> PyTree:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), tree)
-
-
-def _unordered(traced: Any) -> list[str]:
-    return [f"{s.primitive} at {s.source}" for s in list_scatter_sums(traced.jaxpr)]

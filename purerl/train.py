@@ -6,7 +6,6 @@ inlines a loop of one trip), whose bits may differ; with one program for all int
 evaluation and checkpoints cannot change a bit.
 """
 
-import functools
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -15,16 +14,14 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import numpy as np
 
-from purerl import checkpoint, ppo
+from purerl import checkpoint
+from purerl.compilation import Programs
 from purerl.config import Config
-from purerl.deterministic import list_scatter_sums
-from purerl.env import Env
 from purerl.errors import RunError, StoppedError
-from purerl.evaluation import evaluate_in_run
 from purerl.experiment import Evaluation
 from purerl.loggers import Record, Say, summarize
 from purerl.recorder import Recorder
-from purerl.types import Array, Metrics, Network, PyTree, TrainState, count_as_int
+from purerl.types import Metrics, PyTree, TrainState, count_as_int
 
 MAX_SKIPPED_IN_A_ROW = 10
 DEFAULT_LINES = 500  # in metrics.jsonl, about
@@ -69,71 +66,6 @@ def evenly(number: int, updates: int, every: int) -> tuple[int, ...]:
     """Spreads `number` events over the run, each at the end of a chunk, the last at the run's."""
     chunks = [-(-updates * i // (number * every)) for i in range(1, number + 1)]
     return tuple(sorted({min(chunk * every, updates) for chunk in chunks}))
-
-
-class Programs(NamedTuple):
-    """A run's compiled functions; of S vmapped seeds every array has a leading axis [S].
-
-    `update` and `evaluate` take a TrainState, or what `spread` makes of one for several devices.
-    """
-
-    init: Callable[[Array], TrainState]
-    update: Callable[[Any], tuple[Any, Metrics]]
-    evaluate: Callable[[Any], Metrics]
-    seconds: dict[str, float]  # that compiling each took
-    unordered: list[str]  # sums of the update whose order nothing fixes on a GPU
-    spread: Callable[[TrainState], Any] = lambda state: state  # onto the devices, for the others
-    fetch: Callable[[Any], TrainState] = lambda state: state  # back onto one
-
-
-def abstract_state(config: Config, env: Env, network: Network) -> PyTree:
-    """Returns the shapes and dtypes of a run's state without computing anything."""
-    return jax.eval_shape(functools.partial(ppo.init, config, env, network), jax.random.key(0))
-
-
-def compile_programs(
-    config: Config,
-    env: Env,
-    network: Network,
-    evaluation: Evaluation,
-    fresh: bool,
-    vmapped_seeds: int = 1,
-) -> Programs:
-    """Compiles what a run calls; `init` only for a fresh one, `evaluate` only if planned."""
-    # Initialisation is one program too: computed eagerly, its bits are others.
-    init = functools.partial(ppo.init, config, env, network)
-    update = functools.partial(ppo.update, config, env, network)
-    judge = functools.partial(evaluate_in_run, config, env, network, evaluation.num_episodes)
-    key = jax.random.key(0)
-    if vmapped_seeds > 1:
-        init, update, judge = jax.vmap(init), jax.vmap(update), jax.vmap(judge)
-        key = jax.random.split(key, vmapped_seeds)
-    abstract = jax.eval_shape(init, key)
-    seconds: dict[str, float] = {}
-    start = time.perf_counter()
-    traced = jax.jit(update, donate_argnums=0).trace(abstract)
-    compiled = traced.lower().compile()
-    seconds["update"] = time.perf_counter() - start
-    compile_init = _compile if fresh else _compile_later
-    compile_judge = _compile if evaluation.number else _compile_later
-    return Programs(
-        init=compile_init("init", jax.jit(init), key, seconds),
-        update=compiled,
-        evaluate=compile_judge("evaluation", jax.jit(judge), abstract, seconds),
-        seconds=seconds,
-        unordered=sorted({f"{s.primitive} at {s.source}" for s in list_scatter_sums(traced.jaxpr)}),
-    )
-
-
-def _compile_later(name: str, function: Any, argument: PyTree, seconds: dict[str, float]) -> Any:
-    return function
-
-
-def _compile(name: str, function: Any, argument: PyTree, seconds: dict[str, float]) -> Any:
-    start = time.perf_counter()
-    compiled = function.lower(argument).compile()
-    seconds[name] = time.perf_counter() - start
-    return compiled
 
 
 def summarize_evaluation(metrics: Metrics) -> Record:

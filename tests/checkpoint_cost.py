@@ -16,7 +16,7 @@ from typing import Any
 
 import jax
 
-from purerl import checkpoint, console, experiment, ppo, rundir, train
+from purerl import checkpoint, compilation, console, experiment, ppo, rundir
 from purerl.cli import parse
 from purerl.launch import set_up_jax
 from purerl.run import from_command_line
@@ -37,7 +37,7 @@ def main() -> None:
     set_up_jax(True)
     setup = rundir.build(chosen)
     state = jax.jit(functools.partial(ppo.init, *setup[:3]))(jax.random.key(1))
-    abstract = train.abstract_state(*setup[:3])
+    abstract = compilation.abstract_state(*setup[:3])
     jax.block_until_ready(state)
     with tempfile.TemporaryDirectory() as folder:
         leaves, holds_up = median(lambda: checkpoint.flatten(state))

@@ -12,6 +12,7 @@ EFFECTS = {
     "checkpoint",
     "cli",
     "compare",
+    "compilation",
     "console",
     "distributed",
     "errors",

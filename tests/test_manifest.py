@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from purerl import kernels, manifest, ppo, train
+from purerl import compilation, kernels, manifest, ppo
 from purerl.deterministic import list_scatter_sums
 from purerl.experiment import Evaluation, load
 from purerl.rundir import build
@@ -91,7 +91,7 @@ def test_no_update_has_a_sum_without_a_fixed_order(name):
     source = load(ROOT / "experiments" / f"{name}.py").experiment
     config, env, network, _ = build(dataclasses.replace(source, engine="jax"))
     update = functools.partial(ppo.update, config, env, network)
-    trace = jax.make_jaxpr(update)(train.abstract_state(config, env, network))
+    trace = jax.make_jaxpr(update)(compilation.abstract_state(config, env, network))
     assert list_scatter_sums(trace) == []
 
 
@@ -105,7 +105,7 @@ def test_a_sum_without_a_fixed_order_is_found(monkeypatch):
         total = jnp.zeros(2).at[place].add(value)
         return output._replace(value=output.value + 0.0 * total.sum()), carry
 
-    programs = train.compile_programs(
+    programs = compilation.compile_programs(
         config, env, network._replace(apply=apply), Evaluation(number=0), fresh=False
     )
     assert programs.unordered

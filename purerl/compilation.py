@@ -1,0 +1,100 @@
+"""A run's programs: its beginning, one update, one evaluation; compiled at the same time.
+
+XLA compiles without holding Python's lock. Training starts as soon as it can: nobody waits for the
+evaluation before the first one is due.
+"""
+
+import functools
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax
+
+from purerl import ppo
+from purerl.config import Config
+from purerl.deterministic import list_scatter_sums
+from purerl.env import Env
+from purerl.evaluation import evaluate_in_run
+from purerl.experiment import Evaluation
+from purerl.types import Array, Metrics, Network, PyTree, TrainState
+
+
+class Programs(NamedTuple):
+    """A run's compiled functions; of S vmapped seeds every array has a leading axis [S].
+
+    `update` and `evaluate` take a TrainState, or what `spread` makes of one for several devices.
+    """
+
+    init: Callable[[Array], TrainState]
+    update: Callable[[Any], tuple[Any, Metrics]]
+    evaluate: Callable[[Any], Metrics]
+    seconds: dict[str, float]  # that each has taken to compile, as far as they are ready
+    unordered: list[str]  # sums of the update whose order nothing fixes on a GPU
+    spread: Callable[[TrainState], Any] = lambda state: state  # onto the devices, for the others
+    fetch: Callable[[Any], TrainState] = lambda state: state  # back onto one
+
+
+def abstract_state(config: Config, env: Env, network: Network) -> PyTree:
+    """Returns the shapes and dtypes of a run's state without computing anything."""
+    return jax.eval_shape(functools.partial(ppo.init, config, env, network), jax.random.key(0))
+
+
+def compile_programs(
+    config: Config,
+    env: Env,
+    network: Network,
+    evaluation: Evaluation,
+    fresh: bool,
+    vmapped_seeds: int = 1,
+) -> Programs:
+    """Compiles what a run calls; `init` only for a fresh one, `evaluate` only if planned."""
+    # Initialisation is one program too: computed eagerly, its bits are others.
+    init = functools.partial(ppo.init, config, env, network)
+    update = functools.partial(ppo.update, config, env, network)
+    judge = functools.partial(evaluate_in_run, config, env, network, evaluation.num_episodes)
+    key = jax.random.key(0)
+    if vmapped_seeds > 1:
+        init, update, judge = jax.vmap(init), jax.vmap(update), jax.vmap(judge)
+        key = jax.random.split(key, vmapped_seeds)
+    abstract = jax.eval_shape(init, key)
+    seconds: dict[str, float] = {}
+    traced = jax.jit(update, donate_argnums=0).trace(abstract)
+    updating = start("update", traced, seconds)
+    begin, evaluate = jax.jit(init), jax.jit(judge)
+    beginning = start("init", begin.trace(key), seconds) if fresh else None
+    judging = start("evaluation", evaluate.trace(abstract), seconds) if evaluation.number else None
+    return Programs(
+        init=beginning.result() if beginning else begin,
+        update=updating.result(),
+        evaluate=when_ready(judging) if judging else evaluate,
+        seconds=seconds,
+        unordered=unordered(traced),
+    )
+
+
+def start(name: str, traced: Any, seconds: dict[str, float]) -> Future[Any]:
+    """Compiles a traced program in a thread of its own, and notes how many seconds it took."""
+    begin = time.perf_counter()
+    lowered = traced.lower()
+
+    def compile_it() -> Any:
+        compiled = lowered.compile()
+        seconds[name] = time.perf_counter() - begin
+        return compiled
+
+    pool = ThreadPoolExecutor(1, f"purerl-compile-{name}")
+    future = pool.submit(compile_it)
+    pool.shutdown(wait=False)
+    return future
+
+
+def when_ready(program: Future[Any]) -> Callable[..., Any]:
+    """Returns a function that waits for its program when it is called."""
+    return lambda *arguments: program.result()(*arguments)
+
+
+def unordered(traced: Any) -> list[str]:
+    """Lists the sums of a traced program whose order nothing fixes on a GPU."""
+    return sorted({f"{s.primitive} at {s.source}" for s in list_scatter_sums(traced.jaxpr)})
