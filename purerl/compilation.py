@@ -1,7 +1,9 @@
-"""A run's programs: its beginning, one update, one evaluation; compiled at the same time.
+"""A run's programs: its beginning, the two halves of an update, the evaluation.
 
-XLA compiles without holding Python's lock. Training starts as soon as it can: nobody waits for the
-evaluation before the first one is due.
+They are compiled at the same time: XLA does not hold Python's lock. Training starts as soon as it
+can: nobody waits for the evaluation before the first one is due. An update is two programs because
+JAX's cache refuses one with a call to the host, as the `c` engine has it: so the half that learns
+is compiled once, not at every start.
 """
 
 import functools
@@ -50,28 +52,50 @@ def compile_programs(
     vmapped_seeds: int = 1,
 ) -> Programs:
     """Compiles what a run calls; `init` only for a fresh one, `evaluate` only if planned."""
-    # Initialisation is one program too: computed eagerly, its bits are others.
-    init = functools.partial(ppo.init, config, env, network)
-    update = functools.partial(ppo.update, config, env, network)
-    judge = functools.partial(evaluate_in_run, config, env, network, evaluation.num_episodes)
+    functions: list[Callable[..., Any]] = [
+        # Initialisation is a program too: computed eagerly, its bits are others.
+        functools.partial(ppo.init, config, env, network),
+        functools.partial(ppo.collect, config, env, network),
+        functools.partial(ppo.improve, config, network),
+        functools.partial(evaluate_in_run, config, env, network, evaluation.num_episodes),
+    ]
     key = jax.random.key(0)
     if vmapped_seeds > 1:
-        init, update, judge = jax.vmap(init), jax.vmap(update), jax.vmap(judge)
+        functions = [jax.vmap(function) for function in functions]
         key = jax.random.split(key, vmapped_seeds)
+    init, collect, improve, judge = functions
     abstract = jax.eval_shape(init, key)
     seconds: dict[str, float] = {}
-    traced = jax.jit(update, donate_argnums=0).trace(abstract)
-    updating = start("update", traced, seconds)
-    begin, evaluate = jax.jit(init), jax.jit(judge)
+    acting = jax.jit(collect, donate_argnums=0).trace(abstract)
+    learning = jax.jit(improve, donate_argnums=0).trace(*shapes(acting.out_info))
+    collecting = start("collect", acting, seconds)
+    improving = start("improve", learning, seconds)
+    begin: Any = jax.jit(init)
+    evaluate: Any = jax.jit(judge)
     beginning = start("init", begin.trace(key), seconds) if fresh else None
-    judging = start("evaluation", evaluate.trace(abstract), seconds) if evaluation.number else None
+    both = functools.partial(update, collecting.result(), improving.result())
+    begin = beginning.result() if beginning else begin
+    if evaluation.number:  # last, so that it keeps no core from what training waits for
+        evaluate = when_ready(start("evaluation", evaluate.trace(abstract), seconds))
     return Programs(
-        init=beginning.result() if beginning else begin,
-        update=updating.result(),
-        evaluate=when_ready(judging) if judging else evaluate,
+        init=begin,
+        update=both,
+        evaluate=evaluate,
         seconds=seconds,
-        unordered=unordered(traced),
+        unordered=sorted({*unordered(acting), *unordered(learning)}),
     )
+
+
+def update(
+    collect: Callable[..., Any], improve: Callable[..., Any], state: TrainState
+) -> tuple[TrainState, Metrics]:
+    """Makes an update of its two halves, as `ppo.update` does; returns before it is computed."""
+    return improve(*collect(state))
+
+
+def shapes(tree: PyTree) -> PyTree:
+    """Returns the shapes and dtypes of a tree of anything that has them."""
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)
 
 
 def start(name: str, traced: Any, seconds: dict[str, float]) -> Future[Any]:

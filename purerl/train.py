@@ -1,9 +1,9 @@
 """The training loop: compiled programs, called from a host loop that evaluates and records.
 
-The unit of compilation is ONE update. The host calls it `log_every` times without waiting and then
-fetches the window's metrics at once. A scan over k updates would be a program per k (and XLA
-inlines a loop of one trip), whose bits may differ; with one program for all intervals, logging,
-evaluation and checkpoints cannot change a bit.
+The unit of compilation is ONE update (`compilation.py`). The host calls it `log_every` times
+without waiting and then fetches the window's metrics at once. A scan over k updates would be a
+program per k (and XLA inlines a loop of one trip), whose bits may differ; with the same programs
+for all intervals, logging, evaluation and checkpoints cannot change a bit.
 """
 
 import math

@@ -4,6 +4,7 @@ import contextlib
 import json
 from pathlib import Path
 
+import jax
 import pytest
 
 from purerl import checkpoint, recorder, run
@@ -153,7 +154,7 @@ def test_a_lost_seed_is_named(tmp_path, stop_after, capsys):
     from purerl.rundir import restore
 
     state = restore(folder(tmp_path, "seed2"), "latest", print).saved.state
-    state = state.replace(learning_rate=state.learning_rate * 1e42)
+    state = state.replace(params=jax.tree.map(lambda x: x * 1e30, state.params))
     leaves = checkpoint.flatten(state)
     checkpoint.save(path.parent, leaves, meta | {"digest": checkpoint.digest_leaves(leaves)})
     stop_after(10**9)
