@@ -86,7 +86,7 @@ def cpu_seconds(process_id: int) -> float:
 
 
 def compile_times(output: str) -> dict[str, float]:
-    """Reads a run's line "Compiled: update 3.2 s, init 0.9 s"."""
+    """Reads a run's line "Compiled: collect 3.2 s, init 0.9 s"."""
     line = re.search(r"Compiled: (.*)", output)
     found = re.findall(r"(\w+) ([\d.]+) s", line[1] if line else "")
     return {name: float(seconds) for name, seconds in found}

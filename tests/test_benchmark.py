@@ -70,8 +70,8 @@ def test_shares_are_of_the_first_part():
 
 
 def test_compile_times_are_read_from_a_runs_output():
-    output = "plan\nCompiled: update 3.2 s, init 0.9 s, evaluation 11.0 s\nmore 1.0 s"
-    assert start_up.compile_times(output) == {"update": 3.2, "init": 0.9, "evaluation": 11.0}
+    output = "plan\nCompiled: collect 3.2 s, init 0.9 s, improve 11.0 s\nmore 1.0 s"
+    assert start_up.compile_times(output) == {"collect": 3.2, "init": 0.9, "improve": 11.0}
     assert start_up.compile_times("nothing yet") == {}
 
 
@@ -80,7 +80,7 @@ def test_a_start_is_watched_to_its_first_update(tmp_path):
     cold = start_up.start(toy, "c", [], tmp_path, "cold")
     assert 0 < cold.planned <= cold.compiled <= cold.first_update
     assert 0.5 < cold.cpu < 10 * cold.first_update  # importing JAX takes most of a second
-    assert set(cold.compile_times) == {"update", "init", "evaluation"}
+    assert set(cold.compile_times) == {"collect", "improve", "init"}
     assert (cold.engine, cold.cache) == ("c", "cold")
 
 
