@@ -1,9 +1,9 @@
-"""A run's programs: its beginning, the two halves of an update, the evaluation.
+"""A run's programs: its beginning, an update, the evaluation.
 
-They are compiled at the same time: XLA does not hold Python's lock. Training starts as soon as it
-can: nobody waits for the evaluation before the first one is due. An update is two programs because
-JAX's cache refuses one with a call to the host, as the `c` engine has it: so the half that learns
-is compiled once, not at every start.
+They are compiled at the same time: XLA does not hold Python's lock. With the `c` engine an update
+is two programs, because JAX's cache refuses one with a call to the host: so the half that learns is
+compiled once, not at every start. With MJX it is one: acting alone, 256 ants on two cores, never
+ended (all of XLA's threads waiting, jax 0.10.2), where the whole update does.
 """
 
 import functools
@@ -50,11 +50,16 @@ def compile_programs(
     evaluation: Evaluation,
     fresh: bool,
     vmapped_seeds: int = 1,
+    calls_host: bool = False,
 ) -> Programs:
-    """Compiles what a run calls; `init` only for a fresh one, `evaluate` only if planned."""
+    """Compiles what a run calls; `init` only for a fresh one, `evaluate` only if planned.
+
+    With `calls_host`, as the `c` engine does, an update is compiled as two programs.
+    """
     functions: list[Callable[..., Any]] = [
         # Initialisation is a program too: computed eagerly, its bits are others.
         functools.partial(ppo.init, config, env, network),
+        functools.partial(ppo.update, config, env, network),
         functools.partial(ppo.collect, config, env, network),
         functools.partial(ppo.improve, config, network),
         functools.partial(evaluate_in_run, config, env, network, evaluation.num_episodes),
@@ -63,26 +68,26 @@ def compile_programs(
     if vmapped_seeds > 1:
         functions = [jax.vmap(function) for function in functions]
         key = jax.random.split(key, vmapped_seeds)
-    init, collect, improve, judge = functions
+    init, whole, collect, improve, judge = functions
     abstract = jax.eval_shape(init, key)
     seconds: dict[str, float] = {}
-    acting = jax.jit(collect, donate_argnums=0).trace(abstract)
-    learning = jax.jit(improve, donate_argnums=0).trace(*shapes(acting.out_info))
-    collecting = start("collect", acting, seconds)
-    improving = start("improve", learning, seconds)
+    parts = [("collect", collect), ("improve", improve)] if calls_host else [("update", whole)]
+    given, traced, started = (abstract,), [], []
+    for name, part in parts:
+        traced.append(jax.jit(part, donate_argnums=0).trace(*given))
+        started.append(start(name, traced[-1], seconds))
+        given = shapes(traced[-1].out_info)
     begin: Any = jax.jit(init)
     evaluate: Any = jax.jit(judge)
     beginning = start("init", begin.trace(key), seconds) if fresh else None
-    both = functools.partial(update, collecting.result(), improving.result())
-    begin = beginning.result() if beginning else begin
-    if evaluation.number:  # last, so that it keeps no core from what training waits for
-        evaluate = when_ready(start("evaluation", evaluate.trace(abstract), seconds))
+    judging = start("evaluation", evaluate.trace(abstract), seconds) if evaluation.number else None
+    compiled = [part.result() for part in started]
     return Programs(
-        init=begin,
-        update=both,
-        evaluate=evaluate,
+        init=beginning.result() if beginning else begin,
+        update=functools.partial(update, *compiled) if calls_host else compiled[0],
+        evaluate=judging.result() if judging else evaluate,
         seconds=seconds,
-        unordered=sorted({*unordered(acting), *unordered(learning)}),
+        unordered=sorted({place for part in traced for place in unordered(part)}),
     )
 
 
@@ -112,11 +117,6 @@ def start(name: str, traced: Any, seconds: dict[str, float]) -> Future[Any]:
     future = pool.submit(compile_it)
     pool.shutdown(wait=False)
     return future
-
-
-def when_ready(program: Future[Any]) -> Callable[..., Any]:
-    """Returns a function that waits for its program when it is called."""
-    return lambda *arguments: program.result()(*arguments)
 
 
 def unordered(traced: Any) -> list[str]:

@@ -92,7 +92,9 @@ def execute(
         if shards.number > 1:
             made = spread.compile_programs(*setup[:3], chosen.evaluation, fresh, shards)
         else:
-            made = compilation.compile_programs(*setup[:3], chosen.evaluation, fresh, vmapped)
+            made = compilation.compile_programs(
+                *setup[:3], chosen.evaluation, fresh, vmapped, setup.engine == "c"
+            )
         if platform == "gpu" and distributed.is_first():
             reasons = manifest.inexact_because(setup.engine, chosen_by, made.unordered)
             for folder in runs:

@@ -18,7 +18,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
 from purerl import ppo
-from purerl.compilation import Programs, start, unordered, when_ready
+from purerl.compilation import Programs, start, unordered
 from purerl.config import Config
 from purerl.env import Env
 from purerl.evaluation import evaluate_in_run
@@ -207,7 +207,7 @@ def compile_programs(
     )
     if evaluation.number:
         here = _placed(learned, SingleDeviceSharding(device))
-        judge = when_ready(start("evaluation", judge.trace(here), seconds))
+        judge = start("evaluation", judge.trace(here), seconds).result()
     make: Any = jax.jit(init)
     if fresh:
         make = start("init", make.trace(key), seconds).result()
