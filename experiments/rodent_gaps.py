@@ -2,7 +2,10 @@
 
 python -m purerl.run rodent_gaps
 
-Measured: 0.6 gaps after 3 M steps (38 min on two shared CPU cores); not solved yet.
+Measured after 8 M steps (two CPU cores, shared; about an hour alone), in 128 unseen corridors: 4.7
+gaps crossed on average, 1 or more in all, 5 or more in 43%; the policy of `rodent_run`, 0.8. The
+first 3 M steps had rollouts of 64; it was still learning. This one (seed 1) has turned round and
+runs tail first at 2.1 m/s, upright: the reward asks for speed along the corridor, not for a heading.
 """
 
 from envs import run
@@ -23,9 +26,9 @@ experiment = Experiment(
     # At a larger scale the control cost of 38 actuators outweighs being alive, and falling pays.
     network=networks.MlpOptions(policy_hidden=(256, 256), value_hidden=(256, 256), initial_std=0.3),
     ppo=Config(
-        num_steps=3_000_000,
+        num_steps=8_000_000,
         num_envs=128,
-        rollout_length=64,
+        rollout_length=32,
         num_epochs=4,
         num_minibatches=8,
         episode_length=500,  # 10 s
