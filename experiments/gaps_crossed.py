@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from purerl import rundir
+from purerl.errors import UserError
 from purerl.evaluation import evaluate
 from purerl.keys import Purpose, derive
 from purerl.types import Array, Network, Normal, PolicyOutput, TrainState
@@ -97,4 +98,7 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except UserError as error:
+        sys.exit(f"purerl: {error}")

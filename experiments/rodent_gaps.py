@@ -5,7 +5,7 @@ python -m purerl.run rodent_gaps
 Measured after 8 M steps (two CPU cores, shared; about an hour alone), in 128 unseen corridors: 4.7
 gaps crossed on average, 1 or more in all, 5 or more in 43%; the policy of `rodent_run`, 0.8. The
 first 3 M steps had rollouts of 64; it was still learning. This one (seed 1) has turned round and
-runs tail first at 2.1 m/s, upright: the reward asks for speed along the corridor, not for a heading.
+runs tail first at 2.1 m/s, upright: the reward asks for speed along the corridor, for no heading.
 """
 
 from envs import run
