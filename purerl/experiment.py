@@ -86,9 +86,12 @@ def folders() -> list[Path]:
 
 
 def available() -> dict[str, Path]:
-    """Returns the named experiments, name -> file; the first folder wins."""
+    """Returns the named experiments, name -> file; the first folder wins.
+
+    Scripts stand beside them: an experiment is a file that gives its `experiment` a value.
+    """
     files = [file for folder in reversed(folders()) for file in sorted(folder.glob("*.py"))]
-    return {file.stem: file for file in files if not file.stem.startswith("_")}
+    return {file.stem: file for file in files if "\nexperiment = " in file.read_text()}
 
 
 def summary(path: Path) -> str:

@@ -28,7 +28,9 @@ def test_an_experiment_is_found_by_name_path_and_module(place):
     ]:
         source = experiment.find(name)
         assert source.name == expected and source.experiment.env.steps == 4
-    assert "hopper" in experiment.available()
+    (place / "experiments" / "plot.py").write_text('"""A script."""\n')
+    found = experiment.available()
+    assert "hopper" in found and not {"plot", "benchmark"} & set(found)
 
 
 @pytest.mark.parametrize("name", ["hoper", "experiments/none.py", "tests.none_such", "no_such.x"])
