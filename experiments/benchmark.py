@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 
 from experiments import start_up
-from purerl import cli, kernels, ppo, run, rundir
+from purerl import cli, kernels, learner, ppo, run, rundir, targets
 from purerl.console import size
 from purerl.evaluation import evaluate
 from purerl.experiment import Experiment, find
@@ -94,12 +94,12 @@ def make_bench(experiment: Experiment, names: Sequence[str] = PARTS) -> Bench:
     state = jax.jit(partial(ppo.init, config, env, network))(key)
     state, transitions, _, last = jax.jit(partial(rollout, config, env, network))(state)
     first = state.episode.length == 0
-    batch = jax.jit(partial(ppo.make_batch, config))(state, transitions, last, first)
+    batch = jax.jit(partial(targets.make_batch, config))(state, transitions, last, first)
     steps, episodes = config.steps_per_update, experiment.evaluation.num_episodes
     programs: list[tuple[str, Callable, tuple, int | None]] = [
         ("physics alone", partial(bare_physics, env, config), (state, key), steps),
         ("rollout", partial(rollout, config, env, network), (state,), steps),
-        ("learner", partial(ppo.learn, config, network), (state, batch, state.carry), steps),
+        ("learner", partial(learner.learn, config, network), (state, batch, state.carry), steps),
         ("update", partial(ppo.update, config, env, network), (state,), steps),
         (
             "evaluation",

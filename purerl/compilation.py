@@ -32,7 +32,7 @@ class Programs(NamedTuple):
     init: Callable[[Array], TrainState]
     update: Callable[[Any], tuple[Any, Metrics]]
     evaluate: Callable[[Any], Metrics]
-    seconds: dict[str, float]  # that each has taken to compile, as far as they are ready
+    seconds: dict[str, float]  # that each took to compile, side by side
     unordered: list[str]  # sums of the update whose order nothing fixes on a GPU
     spread: Callable[[TrainState], Any] = lambda state: state  # onto the devices, for the others
     fetch: Callable[[Any], TrainState] = lambda state: state  # back onto one
@@ -98,9 +98,9 @@ def update(
     return improve(*collect(state))
 
 
-def shapes(tree: PyTree) -> PyTree:
-    """Returns the shapes and dtypes of a tree of anything that has them."""
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)
+def shapes(tree: PyTree, sharding: Any = None) -> PyTree:
+    """Returns the shapes and dtypes of a tree of anything that has them, laid out as `sharding`."""
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), tree)
 
 
 def start(name: str, traced: Any, seconds: dict[str, float]) -> Future[Any]:

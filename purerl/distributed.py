@@ -4,7 +4,6 @@ All compute the same; the first alone touches the run's folder. What only it can
 run may be written, where it goes on, from what state) it tells the others, its errors included.
 """
 
-import functools
 import json
 import os
 import sys
@@ -139,8 +138,8 @@ class Silent:
     def __init__(self, folder: Path | None = None) -> None:
         """Names the run's checkpoints, for messages."""
         self.checkpoints = folder / "checkpoints" if folder else None
-        nothing = functools.partial(self._nothing)
-        self.say = self.show = self.write = self.save = self.finish = self.close = nothing
+        self.say = self.show = self.write = self._nothing
+        self.save = self.finish = self.close = self._nothing
 
     def _nothing(self, *arguments: Any) -> None:
         """Does nothing."""

@@ -28,6 +28,7 @@ from purerl import (
     spread,
     train,
 )
+from purerl.config import Config
 from purerl.distributed import alone
 from purerl.errors import RunError, UserError
 from purerl.experiment import Experiment, Source
@@ -63,7 +64,9 @@ def execute(
     loggers = needed_loggers(options)
     cache = set_up_jax(options.cache)
     setup = rundir.build(chosen)
-    shards = choose_shards(setup, options, alone(lambda: shards_on_disk(runs)))
+    abstract = compilation.abstract_state(*setup[:3])
+    begun_with = alone(lambda: shards_on_disk(runs))
+    shards = choose_shards(setup.config, abstract, options, begun_with)
     plan = train.make_plan(setup.config, chosen.evaluation, options.checkpoints, options.log_every)
     schedule = {"log_every": plan.log_every, "checkpoints": options.checkpoints}
     platform = jax.default_backend()
@@ -84,7 +87,6 @@ def execute(
         print("\n".join(lines), flush=True)
         return not all(any((folder / "checkpoints").glob("*")) for folder in runs)
 
-    abstract = compilation.abstract_state(*setup[:3])
     fresh = alone(prepare)
 
     @functools.cache
@@ -119,7 +121,7 @@ def shards_on_disk(folders: Iterable[Path]) -> int:
     return rundir.read_json(begun[0] / "manifest.json").get("num_shards", 1) if begun else 0
 
 
-def choose_shards(setup: rundir.Setup, options: "Options", begun_with: int) -> Shards:
+def choose_shards(config: Config, abstract: PyTree, options: "Options", begun_with: int) -> Shards:
     """Returns the shards asked for, or those of the run that goes on, or one for each device.
 
     Raises:
@@ -142,8 +144,8 @@ def choose_shards(setup: rundir.Setup, options: "Options", begun_with: int) -> S
         )
     shards = Shards(number, devices if number > 1 else 1)
     try:
-        check_sizes(shards, setup.config.num_envs)
-        ppo.check_sizes(setup.config, compilation.abstract_state(*setup[:3]).carry, number)
+        check_sizes(shards, config.num_envs)
+        ppo.check_sizes(config, abstract.carry, number)
     except ValueError as error:
         raise UserError(str(error)) from error
     return shards

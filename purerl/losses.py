@@ -37,10 +37,11 @@ def weighted_variance(x: Array, weight: Array, mean: Array, shards: Shards = WHO
 
 def advantage_scale(advantage: Array, weight: Array, shards: Shards = WHOLE) -> Scale:
     """Returns weighted mean and standard deviation of a minibatch's advantages."""
-    mean = weighted_mean(advantage, weight, shards)
-    variance = weighted_variance(advantage, weight, mean, shards)
-    weights = jnp.maximum(total(shards, jnp.sum, weight), 1.0)
-    return Scale(weight=weights, mean=mean, std=jnp.sqrt(variance))
+    whole, weights = total(shards, lambda x, w: ((w * x).sum(), w.sum()), advantage, weight)
+    weights = jnp.maximum(weights, 1.0)
+    mean = whole / weights
+    squares = total(shards, lambda x, w: (w * jnp.square(x - mean)).sum(), advantage, weight)
+    return Scale(weight=weights, mean=mean, std=jnp.sqrt(squares / weights))
 
 
 def normalize_advantage(advantage: Array, scale: Scale) -> Array:

@@ -20,11 +20,8 @@ from typing import Any
 PACKAGES = ["jax", "jaxlib", "mujoco", "mujoco-mjx", "dm-control", "flax", "optax", "numpy"]
 PACKAGES += ["orbax-checkpoint"]
 INFORMATIVE = {"run_id", "git_revision", "git_dirty", "allowed_changes"}
-INFORMATIVE |= {
-    "devices",
-    "bit_exact",
-    "inexact_because",
-}  # what they follow from is compared itself
+INFORMATIVE |= {"devices"}  # how many share the shards
+INFORMATIVE |= {"bit_exact", "inexact_because"}  # what they follow from is compared itself
 FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE", "JAX_PLATFORMS", "JAX_ENABLE_X64")
 
 

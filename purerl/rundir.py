@@ -53,9 +53,8 @@ def build(chosen: Experiment) -> Setup:
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state.observation)
         network = chosen.build_network(chosen.network, zeros, env.action_size)
         setup = Setup(chosen.ppo, env, network, engine)
-        compilation.abstract_state(
-            *setup[:3]
-        )  # sizes that do not fit together show here, in a second
+        # Sizes that do not fit together show here, in a second.
+        compilation.abstract_state(*setup[:3])
     except (ValueError, ImportError) as error:
         raise UserError(one_line(error)) from error
     return setup

@@ -18,7 +18,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
 from purerl import ppo
-from purerl.compilation import Programs, start, unordered
+from purerl.compilation import Programs, shapes, start, unordered
 from purerl.config import Config
 from purerl.env import Env
 from purerl.evaluation import evaluate_in_run
@@ -88,12 +88,11 @@ def on(device: Any, tree: PyTree) -> PyTree:
 def assemble(layout: Layout, spec: PartitionSpec, trees: Sequence[PyTree]) -> PyTree:
     """Makes arrays of all devices out of those of each device here, without a copy."""
     sharding = NamedSharding(layout.mesh, spec)
-    factor = layout.shards.devices if spec == SPLIT else 1
 
     def one(*parts: Array) -> Array:
         shape = parts[0].shape
         if spec == SPLIT:
-            shape = (shape[0] * factor, *shape[1:])
+            shape = (shape[0] * layout.shards.devices, *shape[1:])
         return jax.make_array_from_single_device_arrays(shape, sharding, list(parts))
 
     return jax.tree.map(one, *trees)
@@ -198,23 +197,22 @@ def compile_programs(
     )
     mesh = layout.mesh
     traced = improve.trace(
-        _placed(learned, NamedSharding(mesh, SAME)), _placed(whole, NamedSharding(mesh, SPLIT))
+        shapes(learned, NamedSharding(mesh, SAME)), shapes(whole, NamedSharding(mesh, SPLIT))
     )
     improving = start("update", traced, seconds)
     device = layout.here[0][0]
     judge: Any = jax.jit(
         functools.partial(judge_policy, config, env, network, evaluation.num_episodes, abstract)
     )
-    if evaluation.number:
-        here = _placed(learned, SingleDeviceSharding(device))
-        judge = start("evaluation", judge.trace(here), seconds).result()
+    here = shapes(learned, SingleDeviceSharding(device))
+    judging = start("evaluation", judge.trace(here), seconds) if evaluation.number else None
     make: Any = jax.jit(init)
-    if fresh:
-        make = start("init", make.trace(key), seconds).result()
+    making = start("init", make.trace(key), seconds) if fresh else None
     improve = improving.result()
     seconds["update"] = time.perf_counter() - begin
+    judge = judging.result() if judging else judge
     return Programs(
-        init=make,
+        init=making.result() if making else make,
         update=functools.partial(update, layout, collects, improve),
         evaluate=lambda state: judge(on(device, state.learned)),
         seconds=seconds,
@@ -238,7 +236,7 @@ def compile_collects(
 
     def build(device: Any) -> Any:
         here = SingleDeviceSharding(device)
-        return program.lower(*_placed((learned, places, first), here)).compile()
+        return program.lower(*shapes((learned, places, first), here)).compile()
 
     (device, _), *others = layout.here
     # The first alone: where the persistent cache serves all devices, the others find it there.
@@ -260,7 +258,3 @@ def judge_policy(
     """Evaluates on one device, whatever their number."""
     carry = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), abstract.carry)
     return evaluate_in_run(config, env, network, num_episodes, learned.replace(carry=carry))
-
-
-def _placed(tree: PyTree, sharding: Any) -> PyTree:
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), tree)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from purerl import networks, normalizer, ppo, targets
+from purerl import learner, networks, normalizer, ppo, targets
 from purerl.env import State
 from purerl.rollout import rollout
 from purerl.types import count_as_int
@@ -166,7 +166,7 @@ def test_where_the_learning_rate_of_an_update_comes_from(schedule, update, rate)
     """100 updates; 0.5 is the setting, 0.1 what the state was left with."""
     config = dataclasses.replace(CONFIG, schedule=schedule, learning_rate=0.5)
     state = setup()[2].replace(learning_rate=jnp.float32(0.1), update=jnp.int32(update))
-    assert ppo.scheduled_rate(config, state) == pytest.approx(rate)
+    assert learner.scheduled_rate(config, state) == pytest.approx(rate)
 
 
 def slow_batch(transitions, last_value, observations_before_reset, value_of, gamma, lambda_):
@@ -189,7 +189,7 @@ def slow_batch(transitions, last_value, observations_before_reset, value_of, gam
 def test_truncation_bootstraps_from_the_observation_before_the_reset():
     env, network, state = setup(env=Walk(edge=1.5))
     after, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
-    batch = ppo.make_batch(CONFIG, state, transitions, last_value, state.episode.length == 0)
+    batch = targets.make_batch(CONFIG, state, transitions, last_value, state.episode.length == 0)
     transitions = jax.tree.map(np.asarray, transitions)
     assert transitions.terminated.any() and transitions.truncated.any()
     moved = transitions.observation[..., 0] + np.tanh(transitions.raw_action[..., 0])
@@ -218,8 +218,8 @@ def test_recurrent_memory_restarts_with_each_episode_in_rollout_and_learner():
     assert jnp.abs(state.carry).max() > 0
     _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
     first = state.episode.length == 0
-    batch = ppo.make_batch(CONFIG, state, transitions, last_value, first)
-    output = ppo.unroll(network, state.params, batch, state.carry)
+    batch = targets.make_batch(CONFIG, state, transitions, last_value, first)
+    output = learner.unroll(network, state.params, batch, state.carry)
     np.testing.assert_allclose(output.value, transitions.value, rtol=1e-5, atol=1e-6)
     # By hand: at a start the memory is zero.
     t, b = np.argwhere(np.asarray(batch.first)[1:])[0] + [1, 0]
@@ -278,8 +278,8 @@ def test_a_lost_sample_has_no_weight_in_the_update():
     )
     learned = []
     for x in (lost, odd):
-        batch = ppo.make_batch(CONFIG, state, x, last_value, state.episode.length == 0)
-        learned.append(ppo.learn(CONFIG, network, state, batch, ())[0])
+        batch = targets.make_batch(CONFIG, state, x, last_value, state.episode.length == 0)
+        learned.append(learner.learn(CONFIG, network, state, batch, ())[0])
     for a, b in zip(*(jax.tree.leaves(x.params) for x in learned), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -288,14 +288,14 @@ def test_a_non_finite_minibatch_is_skipped_and_counted():
     env, network, state = setup()
     _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
     broken = transitions._replace(reward=transitions.reward.at[:].set(jnp.nan))
-    batch = ppo.make_batch(CONFIG, state, broken, last_value, state.episode.length == 0)
-    after, metrics = ppo.learn(CONFIG, network, state, batch, ())
+    batch = targets.make_batch(CONFIG, state, broken, last_value, state.episode.length == 0)
+    after, metrics = learner.learn(CONFIG, network, state, batch, ())
     assert metrics["skipped_minibatches"] == metrics["skipped_in_a_row"] == 6
     assert np.isfinite(metrics["policy_loss"])
     for a, b in zip(jax.tree.leaves(state.params), jax.tree.leaves(after.params), strict=True):
         np.testing.assert_array_equal(a, b)
-    sound = ppo.make_batch(CONFIG, state, transitions, last_value, state.episode.length == 0)
-    again, _ = ppo.learn(CONFIG, network, after, sound, ())
+    sound = targets.make_batch(CONFIG, state, transitions, last_value, state.episode.length == 0)
+    again, _ = learner.learn(CONFIG, network, after, sound, ())
     assert again.skipped_in_a_row == 0
 
 
@@ -316,9 +316,9 @@ def test_linear_schedule_and_exact_budget():
 @pytest.mark.parametrize(("kl", "factor"), [(0.001, 1.5), (0.01, 1.0), (0.1, 1 / 1.5)])
 def test_adaptive_learning_rate(kl, factor):
     config = dataclasses.replace(CONFIG, schedule="adaptive_kl", desired_kl=0.01)
-    rate = ppo.next_rate(config, jnp.asarray(1e-3), jnp.asarray(kl), jnp.asarray(True))
+    rate = learner.next_rate(config, jnp.asarray(1e-3), jnp.asarray(kl), jnp.asarray(True))
     np.testing.assert_allclose(rate, 1e-3 * factor, rtol=1e-6)
-    unmoved = ppo.next_rate(config, jnp.asarray(1e-3), jnp.asarray(kl), jnp.asarray(False))
+    unmoved = learner.next_rate(config, jnp.asarray(1e-3), jnp.asarray(kl), jnp.asarray(False))
     np.testing.assert_allclose(unmoved, 1e-3)
 
 

@@ -16,8 +16,7 @@ from envs.suite import (
     swimmer,
     walker,
 )
-from envs.suite.base import SuiteEnv
-from purerl.model import unknown_name
+from envs.suite.base import SuiteEnv, check_task
 
 TASKS: dict[str, tuple[Any, Any]] = {  # name -> the domain's module and its options
     "acrobot-swingup": (acrobot, acrobot.Options("swingup")),
@@ -51,8 +50,7 @@ class Options:
 
     def __post_init__(self):
         """Refuses a task that there is not."""
-        if self.task not in TASKS:
-            raise ValueError(unknown_name("task", self.task, tuple(TASKS)))
+        check_task(self.task, tuple(TASKS))
 
 
 def build(options: Options = Options(), engine: str = "auto") -> SuiteEnv:  # noqa: B008
