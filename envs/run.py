@@ -162,9 +162,10 @@ class Run:
         torso, center = self.parts.torso, readings.subtree_com[self.parts.torso, 0]
         speed = (center - before) / self.control_timestep
         height, up = readings.xpos[torso, 2], readings.xmat[torso, 2, 2]
-        healthy = is_healthy(self.parts.body, self.options, height, up)
+        turn = jnp.abs(jnp.arctan2(readings.xmat[torso, 1, 0], readings.xmat[torso, 0, 0]))
+        healthy = is_healthy(self.parts.body, self.options, height, up, turn)
         terms = reward_terms(self.options, speed, center - before, healthy, action)
-        metrics = {"forward_velocity": speed, "height": height, "up": up}
+        metrics = {"forward_velocity": speed, "height": height, "up": up, "turn": turn}
         metrics |= {f"reward_{name}": term for name, term in terms.items()}
         task = task | {"center": center}
         finished = jnp.zeros((), bool)
@@ -214,13 +215,15 @@ class Run:
         return jnp.concatenate(parts)
 
 
-def is_healthy(body: Body, options: Options, height: Array, up: Array) -> Array:
-    """Tells whether the body can go on, [] bool: neither fallen, nor thrown up, nor on its back.
+def is_healthy(body: Body, options: Options, height: Array, up: Array, turn: Array) -> Array:
+    """Tells whether the body can go on, [] bool: not fallen, thrown up, on its back or turned.
 
-    `height` [] of the torso [m], `up` [] the z of its up-axis.
+    `height` [] of the torso [m], `up` [] the z of its up-axis, `turn` [] its angle with the way
+    ahead, seen from above [rad].
     """
     low, high = body.healthy_height
-    return (height > low) & (height < high) & (up > options.healthy_up)
+    upright = (height > low) & (height < high) & (up > options.healthy_up)
+    return upright & (turn < body.healthy_turn)
 
 
 def reward_terms(

@@ -30,6 +30,11 @@ def build(name, engine):
 
 
 @functools.cache
+def rodent():
+    return run.build(run.Options(body="rodent"), "c")
+
+
+@functools.cache
 def trajectory(name, engine, height=0.0):
     """Returns the states [T, B] of an open loop from the same starts on every engine.
 
@@ -105,8 +110,8 @@ def test_the_torsos_subtree_is_the_ant_and_only_the_ant():
     ("height", "up", "healthy"), [(0.5, 1.0, True), (0.1, 1.0, False), (0.5, -0.5, False)]
 )
 def test_an_ant_on_its_back_is_not_healthy(height, up, healthy):
-    found = run.is_healthy(ANT, run.Options(), jnp.float32(height), jnp.float32(up))
-    assert bool(found) is healthy
+    height, up, turn = jnp.float32(height), jnp.float32(up), jnp.float32(3.0)
+    assert bool(run.is_healthy(ANT, run.Options(), height, up, turn)) is healthy
 
 
 def test_an_overturned_ant_ends_its_episode():
@@ -116,6 +121,21 @@ def test_an_overturned_ant_ends_its_episode():
     over = state.physics.qpos.at[3:7].set(jnp.array([0.0, 1.0, 0.0, 0.0]))
     after = env.step(state.replace(physics=state.physics.replace(qpos=over)), jnp.zeros(8))
     assert after.terminated and after.metrics["reward_healthy"] == 0.0
+
+
+@pytest.mark.parametrize(("degrees", "over"), [(0, False), (50, False), (-50, False), (90, True)])
+def test_a_rodent_that_turns_from_the_way_ahead_ends_its_episode(degrees, over):
+    env = rodent()
+    state = env.reset(jax.random.key(0))
+    half = np.radians(degrees) / 2
+    # Nose down by 20 degrees as well: pitch is no turn.
+    yaw, pitch = np.array([np.cos(half), 0.0, 0.0, np.sin(half)]), np.radians(10)
+    quaternion = np.zeros(4)
+    mujoco.mju_mulQuat(quaternion, yaw, np.array([np.cos(pitch), 0.0, np.sin(pitch), 0.0]))
+    physics = state.physics.replace(qpos=state.physics.qpos.at[3:7].set(jnp.array(quaternion)))
+    after = env.step(state.replace(physics=physics), jnp.zeros(env.action_size))
+    assert bool(after.terminated) is over
+    assert float(after.metrics["turn"]) == pytest.approx(np.radians(abs(degrees)), abs=0.1)
 
 
 def test_the_ants_reward_is_the_sum_of_its_terms():
