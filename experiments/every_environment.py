@@ -35,7 +35,8 @@ def all_experiments() -> dict[str, Experiment]:
 
 
 def sized(experiment: Experiment, engine: str, num_envs: int, length: int) -> Experiment:
-    """Returns the experiment on an engine, with B environments and rollouts of T steps."""
+    """Returns the experiment on an engine, with B environments, T steps a rollout; 0: its own."""
+    num_envs, length = num_envs or experiment.ppo.num_envs, length or experiment.ppo.rollout_length
     steps = num_envs * length
     config = dataclasses.replace(
         experiment.ppo, num_envs=num_envs, rollout_length=length, num_minibatches=1, num_steps=steps
@@ -67,8 +68,8 @@ def main() -> int:
     experiments = all_experiments()
     parser.add_argument("--engines", nargs="+", default=["c", "jax"])
     parser.add_argument("--only", nargs="+", default=list(experiments), choices=list(experiments))
-    parser.add_argument("--num-envs", type=int, default=64)
-    parser.add_argument("--length", type=int, default=8, help="steps of a rollout")
+    parser.add_argument("--num-envs", type=int, default=0, help="0: its own")
+    parser.add_argument("--length", type=int, default=0, help="steps of a rollout; 0: its own")
     parser.add_argument("--rounds", type=int, default=3)
     options = parser.parse_args()
     print(ROW.format("environment", "engine", "contract", "physics alone", "rollout", "share"))
