@@ -4,8 +4,7 @@ Orbax commits a step by renaming a finished folder, which survives a kill at any
 no array bytes, deletes in place, and its manager's idea of the latest step goes wrong on a full
 disk. So here: hashes beside the arrays, deletion by rename, and the truth read from the folder.
 
-A state travels as `{path: array}`. A typed key's path ends in `|<implementation>`; zero-size
-arrays, which Orbax refuses, count in the digest but are not written.
+Zero-size arrays, which Orbax refuses, count in the digest but are not written.
 """
 
 import hashlib
@@ -23,9 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from purerl.errors import UserError
+from purerl.snapshot import Leaves, digest_leaves, leaf_paths, unflatten
 from purerl.types import PyTree, is_key
-
-Leaves = dict[str, np.ndarray]
 
 
 class DamagedError(Exception):
@@ -38,56 +36,6 @@ class Saved(NamedTuple):
     state: PyTree
     meta: dict[str, Any]  # update, steps, digest, and what else `save` was given
     path: Path
-
-
-# --- a state as named arrays ---
-
-
-def leaf_paths(state: PyTree) -> list[str]:
-    """Returns the path of every leaf, in the order of `jax.tree.leaves`; abstract states too."""
-    named = jax.tree_util.tree_flatten_with_path(state)[0]
-    return [
-        jax.tree_util.keystr(path, simple=True, separator="/") + _key_suffix(leaf)
-        for path, leaf in named
-    ]
-
-
-def flatten(state: PyTree) -> Leaves:
-    """Copies a state to the host as `{path: array}`, keys as their raw data.
-
-    The copy is real: on a CPU `device_get` returns views of buffers that the next, donating update
-    overwrites.
-    """
-    raw = jax.tree.map(lambda x: jax.random.key_data(x) if is_key(x) else x, state)
-    host = [np.array(x, copy=True, order="C") for x in jax.tree.leaves(jax.device_get(raw))]
-    return dict(zip(leaf_paths(state), host, strict=True))
-
-
-def unflatten(leaves: Leaves, abstract: PyTree) -> PyTree:
-    """Rebuilds a state on the device from `flatten`'s arrays (zero-size ones may be absent)."""
-    out = []
-    for path, like in zip(leaf_paths(abstract), jax.tree.leaves(abstract), strict=True):
-        # A real copy again: a buffer shared with numpy must not be donated.
-        array = jnp.array(_empty(like) if like.size == 0 else leaves[path], copy=True)
-        out.append(jax.random.wrap_key_data(array, impl=_impl(like)) if is_key(like) else array)
-    return jax.tree.unflatten(jax.tree.structure(abstract), out)
-
-
-def digest(state: PyTree) -> str:
-    """Returns the sha256 of a state: two runs with equal digests are the same run."""
-    return digest_leaves(flatten(state))
-
-
-def digest_leaves(leaves: Leaves) -> str:
-    """Returns a sha256 over path, dtype, shape and bytes of every leaf, in path order."""
-    total = hashlib.sha256()
-    for path, array in sorted(leaves.items()):
-        total.update(f"{path}\0{array.dtype}\0{array.shape}\0".encode())
-        total.update(array.tobytes())
-    return total.hexdigest()
-
-
-# --- on disk ---
 
 
 def save(folder: Path, leaves: Leaves, meta: dict[str, Any]) -> Path:
@@ -250,21 +198,6 @@ def clean(folder: Path) -> None:
 
 
 # --- parts ---
-
-
-def _impl(key: Any) -> str:
-    """Returns the name of a key's implementation; of abstract keys too, which key_impl refuses."""
-    return str(jax.random.key_impl(jnp.empty((0,), key.dtype)))
-
-
-def _key_suffix(leaf: Any) -> str:
-    return f"|{_impl(leaf)}" if is_key(leaf) else ""
-
-
-def _empty(like: Any) -> np.ndarray:
-    if is_key(like):
-        raise ValueError(f"A zero-size array of keys (shape {like.shape}) cannot be rebuilt.")
-    return np.zeros(like.shape, like.dtype)
 
 
 def _blank(about: dict[str, Any]) -> np.ndarray:

@@ -18,8 +18,9 @@ from purerl.config import Config, check_divides
 from purerl.env import Env
 from purerl.keys import Purpose, derive, per_environment
 from purerl.learner import is_recurrent, learn, optimizer
-from purerl.rollout import Finished, Transition, count_replays, rollout, start_episodes
+from purerl.rollout import Finished, Transition, rollout, start_episodes
 from purerl.shards import WHOLE, Shards, gather, total
+from purerl.starts import count_replays
 from purerl.targets import Batch, make_batch
 from purerl.types import (
     Array,

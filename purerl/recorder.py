@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from purerl import checkpoint
+from purerl import checkpoint, snapshot
 from purerl.errors import RunError, one_line
 from purerl.loggers import BackgroundLogger, MetricsFile, Record, Say
 
@@ -52,14 +52,14 @@ class Recorder:
         self._submit(self._write, record)
 
     def save(
-        self, record: Record, leaves: checkpoint.Leaves, meta: dict[str, Any], planned: bool
+        self, record: Record, leaves: snapshot.Leaves, meta: dict[str, Any], planned: bool
     ) -> None:
         """Like `write`, then saves a checkpoint; waits only while the one before is being written.
 
         Args:
           record: the line; it gets the state's digest when the checkpoint is a planned one. (One
             taken because of a signal must leave no trace in metrics.jsonl.)
-          leaves: `checkpoint.flatten` of the state.
+          leaves: `snapshot.flatten` of the state.
           meta: what the checkpoint should say besides digest and length of metrics.jsonl.
           planned: whether the run would have saved here without being interrupted.
         """
@@ -100,9 +100,9 @@ class Recorder:
             self._failed(f"A line of metrics.jsonl could not be written: {one_line(error)}.")
 
     def _save(
-        self, record: Record, leaves: checkpoint.Leaves, meta: dict[str, Any], planned: bool
+        self, record: Record, leaves: snapshot.Leaves, meta: dict[str, Any], planned: bool
     ) -> None:
-        digest = checkpoint.digest_leaves(leaves)
+        digest = snapshot.digest_leaves(leaves)
         self.last_failed = True
         try:
             offset = self.metrics.append(record | {"digest": digest} if planned else record)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import numpy as np
 
-from purerl import checkpoint
+from purerl import checkpoint, snapshot
 from purerl.compilation import Programs
 from purerl.config import Config
 from purerl.errors import RunError, StoppedError
@@ -196,7 +196,7 @@ def check_finite(
     """
     for i, record in enumerate(records):
         if not math.isfinite(record["train/parameter_norm"]):
-            params = each_seed(checkpoint.flatten(state.params), len(records))[i]
+            params = each_seed(snapshot.flatten(state.params), len(records))[i]
             bad = [k for k, x in params.items() if not np.isfinite(x.astype(np.float64)).all()]
             reason = f"Parameters are not finite: {', '.join(bad) or 'their norm overflows'}. "
             _give_up(i, records, recorders, reason + "Lower ppo.learning_rate.")
@@ -217,7 +217,7 @@ def _save(
     meta: Record,
     planned: bool,
 ) -> None:
-    parts = each_seed(checkpoint.flatten(state), len(records))
+    parts = each_seed(snapshot.flatten(state), len(records))
     for leaves, record, recorder in zip(parts, records, recorders, strict=True):
         score = record.get("eval/episode_return")
         about = meta | {name: record[name] for name in ("update", "steps", "wall_s")}

@@ -16,7 +16,7 @@ from typing import Any
 
 import jax
 
-from purerl import checkpoint, compilation, console, experiment, ppo, rundir
+from purerl import checkpoint, compilation, console, experiment, ppo, rundir, snapshot
 from purerl.cli import parse
 from purerl.launch import set_up_jax
 from purerl.run import from_command_line
@@ -40,11 +40,11 @@ def main() -> None:
     abstract = compilation.abstract_state(*setup[:3])
     jax.block_until_ready(state)
     with tempfile.TemporaryDirectory() as folder:
-        leaves, holds_up = median(lambda: checkpoint.flatten(state))
-        meta = {"update": 1, "digest": checkpoint.digest_leaves(leaves)}
+        leaves, holds_up = median(lambda: snapshot.flatten(state))
+        meta = {"update": 1, "digest": snapshot.digest_leaves(leaves)}
         path, writes = median(lambda: checkpoint.save(Path(folder), leaves, meta))
         restored, restores = median(lambda: checkpoint.load(path, abstract).state)
-        assert checkpoint.digest(restored) == meta["digest"]
+        assert snapshot.digest(restored) == meta["digest"]
         on_disk = sum(f.stat().st_size for f in path.rglob("*") if f.is_file())
     print(f"state     {console.size(state):>12,} bytes in {len(leaves)} leaves")
     print(f"on disk   {on_disk:>12,} bytes")

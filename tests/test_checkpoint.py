@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from purerl import checkpoint
+from purerl import checkpoint, snapshot
 from purerl.errors import UserError
 
 
@@ -28,8 +28,8 @@ def abstract():
 
 
 def save(folder: Path, update: int, number: float | None = None, score: float | None = None):
-    leaves = checkpoint.flatten(make_state(float(update) if number is None else number))
-    meta = {"update": update, "digest": checkpoint.digest_leaves(leaves), "eval_return": score}
+    leaves = snapshot.flatten(make_state(float(update) if number is None else number))
+    meta = {"update": update, "digest": snapshot.digest_leaves(leaves), "eval_return": score}
     return checkpoint.save(folder, leaves, meta)
 
 
@@ -45,7 +45,7 @@ def test_a_state_comes_back_bit_for_bit(tmp_path):
     saved = checkpoint.load(save(tmp_path, 5, 0.1), abstract())
     assert saved.meta["update"] == 5
     assert jax.tree.structure(saved.state) == jax.tree.structure(state)
-    assert checkpoint.digest(saved.state) == checkpoint.digest(state) == saved.meta["digest"]
+    assert snapshot.digest(saved.state) == snapshot.digest(state) == saved.meta["digest"]
     for old, new in zip(jax.tree.leaves(state), jax.tree.leaves(saved.state), strict=True):
         assert old.dtype == new.dtype and old.shape == new.shape
     draw = jax.random.normal(state["key"], (3,))
@@ -55,7 +55,7 @@ def test_a_state_comes_back_bit_for_bit(tmp_path):
 def test_the_digest_is_what_its_definition_says():
     leaves = {"b": np.arange(3, dtype=np.int32), "a": np.zeros((2, 0), np.float32)}
     text = b"a\0float32\0(2, 0)\0" + b"b\0int32\0(3,)\0" + np.arange(3, dtype=np.int32).tobytes()
-    assert checkpoint.digest_leaves(leaves) == hashlib.sha256(text).hexdigest()
+    assert snapshot.digest_leaves(leaves) == hashlib.sha256(text).hexdigest()
 
 
 @pytest.mark.parametrize(
@@ -70,12 +70,12 @@ def test_the_digest_is_what_its_definition_says():
     ],
 )
 def test_the_digest_sees_every_kind_of_change(change):
-    assert checkpoint.digest(change(make_state())) != checkpoint.digest(make_state())
+    assert snapshot.digest(change(make_state())) != snapshot.digest(make_state())
 
 
 def test_flatten_copies():
     # On a CPU a jax.Array hands out a read-only view of its buffer, which donation may overwrite.
-    for path, array in checkpoint.flatten(make_state()).items():
+    for path, array in snapshot.flatten(make_state()).items():
         assert array.flags.owndata and array.flags.writeable, path
 
 
@@ -98,7 +98,7 @@ def test_a_flipped_bit_is_noticed_and_its_leaf_named(tmp_path, monkeypatch):
 
 def test_no_flipped_bit_of_any_array_file_loads_as_something_else(tmp_path):
     path = save(tmp_path, 1)
-    good = checkpoint.digest(make_state(1.0))
+    good = snapshot.digest(make_state(1.0))
     file = largest_file(path)
     content = file.read_bytes()
     noticed = 0
@@ -107,7 +107,7 @@ def test_no_flipped_bit_of_any_array_file_loads_as_something_else(tmp_path):
         damaged[place // 8] ^= 1 << (place % 8)
         file.write_bytes(damaged)
         try:
-            assert checkpoint.digest(checkpoint.load(path, abstract()).state) == good
+            assert snapshot.digest(checkpoint.load(path, abstract()).state) == good
         except checkpoint.DamagedError:
             noticed += 1
     assert noticed > 0
@@ -139,7 +139,7 @@ def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_used(tmp_path, dam
     said = []
     saved = checkpoint.newest(tmp_path, abstract(), said.append)
     assert saved.meta["update"] == 1
-    assert checkpoint.digest(saved.state) == checkpoint.digest(make_state(1.0))
+    assert snapshot.digest(saved.state) == snapshot.digest(make_state(1.0))
     assert len(said) == 1 and "update 2" in said[0] and "damaged-0-000000000002" in said[0]
     assert checkpoint.updates(tmp_path) == [1]
     assert (tmp_path / "damaged-0-000000000002").is_dir()

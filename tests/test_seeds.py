@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from purerl import checkpoint, recorder, run
+from purerl import checkpoint, recorder, run, snapshot
 from purerl.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
 from tests.test_run import ROOT, TOY, Stopper, digest, folder, lines, start
 
@@ -103,7 +103,7 @@ def test_each_vmapped_seed_is_a_run_that_others_can_read(vmapped):
     for number, seed in enumerate(SEEDS, 1):
         found = restore(folder(vmapped, seed), "latest", print)
         assert found.experiment.seed == number
-        assert checkpoint.digest(found.saved.state) == digest(vmapped, seed)
+        assert snapshot.digest(found.saved.state) == digest(vmapped, seed)
 
 
 @pytest.mark.parametrize("questions", [1, 8, 15])
@@ -155,8 +155,8 @@ def test_a_lost_seed_is_named(tmp_path, stop_after, capsys):
 
     state = restore(folder(tmp_path, "seed2"), "latest", print).saved.state
     state = state.replace(params=jax.tree.map(lambda x: x * 1e30, state.params))
-    leaves = checkpoint.flatten(state)
-    checkpoint.save(path.parent, leaves, meta | {"digest": checkpoint.digest_leaves(leaves)})
+    leaves = snapshot.flatten(state)
+    checkpoint.save(path.parent, leaves, meta | {"digest": snapshot.digest_leaves(leaves)})
     stop_after(10**9)
     assert start(tmp_path, *THREE, "--resume") == FAILURE
     said = capsys.readouterr().err
