@@ -6,6 +6,10 @@ matrices, tendons), and nearly all have indices that are known while tracing. He
 is rewritten: each scatter-add with constant indices becomes gathers added in the order of the
 updates, over the addresses that receive any. Nothing of MJX or JAX is patched, so nothing can leak
 into other code, and a new MJX that adds more scatter-adds is covered without being known here.
+
+A loop that counts up to a constant (MJX's Newton iterations) becomes a scan that stands still once
+it is done, with the same results: before each round of a `while` a GPU waits for the host, which
+reads the condition, and programs for several devices wait for one another.
 """
 
 import functools
@@ -14,7 +18,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jax.extend import core
 
@@ -27,10 +30,10 @@ from purerl.folding import (
     known_constant,
     known_literal,
 )
+from purerl.ordered_sums import ordered_scatter, source
 from purerl.types import Array, PyTree
 
 _SUMS = ("scatter-add", "scatter_add", "scatter-mul", "scatter_mul", "scatter-sub", "scatter_sub")
-_FEW_TERMS = 4
 
 
 class ScatterSum(NamedTuple):
@@ -76,7 +79,7 @@ def list_scatter_sums(closed: core.ClosedJaxpr) -> list[ScatterSum]:
     found = []
     for eqn in closed.jaxpr.eqns:
         if _is_unordered(eqn):
-            found.append(ScatterSum(eqn.primitive.name, eqn.invars[0].aval.shape, _source(eqn)))
+            found.append(ScatterSum(eqn.primitive.name, eqn.invars[0].aval.shape, source(eqn)))
         for sub in _sub_jaxprs(eqn):
             found += list_scatter_sums(sub)
     return found
@@ -89,14 +92,6 @@ def _is_unordered(eqn: core.JaxprEqn) -> bool:
     """
     sums = eqn.primitive.name in _SUMS and not eqn.params["unique_indices"]
     return sums and jnp.issubdtype(eqn.invars[0].aval.dtype, jnp.inexact)
-
-
-def _source(eqn: core.JaxprEqn) -> str:
-    """Returns the file and line that traced an equation, outside of JAX itself."""
-    traceback = eqn.source_info.traceback
-    frames = traceback.frames if traceback else []
-    own = [f for f in frames if "/jax/_src/" not in f.file_name] or frames
-    return f"{own[0].file_name}:{own[0].line_num}" if own else "an unknown line"
 
 
 def _sub_jaxprs(eqn: core.JaxprEqn) -> list[core.ClosedJaxpr]:
@@ -171,8 +166,8 @@ def _apply(eqn: core.JaxprEqn, inputs: list, known: list[Known], shared: dict) -
     """Runs one equation, through the replacement for its kind where it has one."""
     name = eqn.primitive.name
     if _is_unordered(eqn):
-        return [_ordered_scatter(eqn, inputs, known)]
-    if not _has_scatter_sum(eqn):
+        return [ordered_scatter(eqn, inputs, known)]
+    if not _has_scatter_sum(eqn) and (name != "while" or rounds(eqn.params, known) is None):
         return bind_equation(eqn, inputs)
     if name in CALLS:
         return _evaluate(called_jaxpr(eqn), known, shared, *inputs)
@@ -208,7 +203,7 @@ def _scan_sizes(params: dict) -> tuple[int, int]:
 
 
 def _while(params: dict, inputs: list, known: list[Known], shared: dict) -> list:
-    """`lax.while_loop` with a rewritten condition and body."""
+    """`lax.while_loop` with a rewritten condition and body; a scan if it counts to a constant."""
     n, m = params["cond_nconsts"], params["body_nconsts"]
     test, body = params["cond_jaxpr"], params["body_jaxpr"]
     carry = list(inputs[n + m :])
@@ -220,7 +215,58 @@ def _while(params: dict, inputs: list, known: list[Known], shared: dict) -> list
     def step(c):
         return _evaluate(body, known[n : n + m] + unknown, shared, *inputs[n : n + m], *c)
 
-    return lax.while_loop(condition, step, carry)
+    limit = rounds(params, known)
+    if limit is None:
+        return lax.while_loop(condition, step, carry)
+
+    def step_unless_done(c, _):
+        going = condition(c)
+        return [jnp.where(going, new, old) for new, old in zip(step(c), c, strict=True)], None
+
+    carry = [jnp.asarray(x, v.aval.dtype) for x, v in zip(carry, body.jaxpr.outvars, strict=True)]
+    return lax.scan(step_unless_done, carry, None, limit)[0]
+
+
+def rounds(params: dict, known: list[Known]) -> int | None:
+    """Returns the most rounds of a `while` that counts to a constant, None of any other.
+
+    Its condition fails when a counter reaches a literal, whatever else ends it earlier, and each
+    round adds 1 to the counter.
+    """
+    n, m = params["cond_nconsts"], params["body_nconsts"]
+    test, body = params["cond_jaxpr"].jaxpr, params["body_jaxpr"].jaxpr
+    for counter, limit in _limits(test):
+        place = test.invars.index(counter) - n if counter in test.invars else -1
+        if place < 0 or known[n + m + place] is None:
+            continue
+        steps = [e for e in body.eqns if body.outvars[place] in e.outvars]
+        if steps and steps[0].primitive.name == "add" and _is_plus_one(steps[0], body, m + place):
+            return max(0, limit - int(known[n + m + place]()))
+    return None
+
+
+def _limits(test: core.Jaxpr) -> list[tuple[core.Var | core.Literal, int]]:
+    """Returns each (variable, literal) for which variable >= literal alone makes `test` false."""
+    made_by = {v: e for e in test.eqns for v in e.outvars}
+    first = made_by.get(test.outvars[0])
+    if first is None or first.primitive.name != "not":
+        return []
+    ends, found = [first.invars[0]], []
+    while ends:
+        eqn = None if isinstance(ends[-1], core.Literal) else made_by.get(ends[-1])
+        ends.pop()
+        if eqn is None:
+            continue
+        if eqn.primitive.name in ("or", "convert_element_type"):
+            ends += eqn.invars
+        elif eqn.primitive.name == "ge" and isinstance(eqn.invars[1], core.Literal):
+            found.append((eqn.invars[0], int(eqn.invars[1].val)))
+    return found
+
+
+def _is_plus_one(eqn: core.JaxprEqn, body: core.Jaxpr, place: int) -> bool:
+    number, one = eqn.invars
+    return number is body.invars[place] and isinstance(one, core.Literal) and int(one.val) == 1
 
 
 def _cond(params: dict, inputs: list, known: list[Known], shared: dict) -> list:
@@ -231,99 +277,3 @@ def _cond(params: dict, inputs: list, known: list[Known], shared: dict) -> list:
 
 
 _LOOPS = {"scan": _scan, "while": _while, "cond": _cond}
-
-
-def _ordered_scatter(eqn: core.JaxprEqn, inputs: list, known: list[Known]) -> Array:
-    """A scatter-add as gathers added in the order of the updates.
-
-    Raises:
-      RuntimeError: the primitive is not a scatter-add, or its indices are not known.
-    """
-    operand, _, updates = inputs
-    if known[1] is None or "add" not in eqn.primitive.name:
-        raise RuntimeError(
-            f"A {eqn.primitive.name} traced at {_source(eqn)} has indices that are known "
-            "only while running, so its sum has no fixed order on a GPU. Ask for fewer readings, "
-            "or change the model so that MJX does not need it."
-        )
-    addresses = _addresses(eqn, np.asarray(known[1]()))
-    touched, turns = _order_of_sums(addresses, updates.size)
-    whole, flat = jnp.reshape(operand, (-1,)), jnp.reshape(updates, (-1,))
-    if (turns == updates.size).any():
-        flat = jnp.concatenate([flat, jnp.zeros(1, flat.dtype)])
-    total = _take(whole, touched)
-    if len(turns) <= _FEW_TERMS:
-        for turn in turns:
-            total = total + _take(flat, turn)
-    else:
-        # One gather and one reduction: a long chain of sums takes XLA minutes to compile.
-        total = total + jnp.sum(_take(flat, turns), axis=0)
-    place = np.arange(operand.size)
-    place[touched] = operand.size + np.arange(len(touched))
-    return jnp.reshape(_take(jnp.concatenate([whole, total]), place), operand.shape)
-
-
-def _take(flat: Array, index: np.ndarray) -> Array:
-    """`flat[index]` of constant indices within bounds, as one operation."""
-    first = index.flat[0] if index.size else 0
-    if index.ndim == 1 and (index == first + np.arange(index.size)).all():
-        return lax.slice(flat, (first,), (first + index.size,))
-    numbers = lax.GatherDimensionNumbers((), (0,), (0,))
-    index = index.astype(np.int32)[..., None]
-    return lax.gather(flat, index, numbers, (1,), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
-
-
-def _addresses(eqn: core.JaxprEqn, indices: np.ndarray) -> np.ndarray:
-    """Returns for each update the flat address it is added to; -1 where it is dropped.
-
-    By XLA's definition of a scatter: each index vector says where a window of updates starts, and
-    a window that does not fit is dropped whole, or moved until it fits (mode CLIP).
-    """
-    shape, updates = eqn.invars[0].aval.shape, eqn.invars[2].aval
-    d = eqn.params["dimension_numbers"]
-    batch_axes = [i for i in range(len(updates.shape)) if i not in d.update_window_dims]
-    batch = tuple(updates.shape[i] for i in batch_axes)
-    absent = (*d.inserted_window_dims, *d.operand_batching_dims)
-    axis_of = dict(
-        zip([i for i in range(len(shape)) if i not in absent], d.update_window_dims, strict=True)
-    )
-    starts = np.zeros((len(shape), *batch), np.int64)
-    for column, dim in enumerate(d.scatter_dims_to_operand_dims):
-        starts[dim] = indices[..., column]
-    for dim, axis in zip(d.operand_batching_dims, d.scatter_indices_batching_dims, strict=True):
-        starts[dim] = np.indices(batch)[axis]
-    sizes = [updates.shape[axis_of[i]] if i in axis_of else 1 for i in range(len(shape))]
-    room = (np.array(shape) - sizes).reshape(-1, *[1] * len(batch)).astype(np.int64)
-    if eqn.params["mode"] == lax.GatherScatterMode.CLIP:
-        starts = np.clip(starts, 0, room)
-    fits = ((starts >= 0) & (starts <= room)).all(0)
-    address = np.zeros(updates.shape, np.int64)
-    steps = np.cumprod([1, *shape[:0:-1]])[::-1] if shape else []
-    spread = tuple(i for i in range(len(updates.shape)) if i not in batch_axes)
-    for dim, step in enumerate(steps):
-        address += step * np.expand_dims(starts[dim], spread)
-        if dim in axis_of:
-            along = [1] * len(updates.shape)
-            along[axis_of[dim]] = sizes[dim]
-            address += step * np.arange(sizes[dim]).reshape(along)
-    return np.where(np.expand_dims(fits, spread), address, -1).reshape(-1)
-
-
-def _order_of_sums(address: np.ndarray, none: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sorts updates by the address that they are added to.
-
-    Args:
-      address: [updates]; -1 where an update is dropped.
-      none: what stands for no update.
-
-    Returns:
-      The addresses that receive any, [touched], ascending; and the number of the k-th update of
-      each, [turns, touched].
-    """
-    kept = np.flatnonzero(address >= 0)
-    order = kept[np.argsort(address[kept], kind="stable")]
-    touched, start, count = np.unique(address[order], return_index=True, return_counts=True)
-    turns = np.full((count.max(initial=0), len(touched)), none)
-    turn = np.arange(len(order)) - np.repeat(start, count)
-    turns[turn, np.repeat(np.arange(len(touched)), count)] = order
-    return touched, turns

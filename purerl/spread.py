@@ -7,6 +7,7 @@ Initialisation and evaluation are programs of one device too.
 """
 
 import functools
+import itertools
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -153,19 +154,31 @@ def collect(
 
 
 def update(
-    layout: Layout, collects: Sequence[Callable], improve: Callable, state: Spread
+    layout: Layout,
+    collects: Sequence[Callable],
+    improve: Callable,
+    told_by: ThreadPoolExecutor,
+    state: Spread,
 ) -> tuple[Spread, Metrics]:
-    """One update; returns as soon as the devices have been told."""
-    shards, places, experience = iter(state.places), [], []
-    for (device, numbers), program in zip(layout.here, collects, strict=True):
-        learned, seen = on(device, state.learned), []
-        for i in numbers:
-            place, part = program(learned, next(shards), np.int32(i * layout.size))
-            places.append(place)
-            seen.append(part)
-        experience.append(join(seen))
+    """One update. Each device is told what to do by a thread of its own.
+
+    A GPU's program with a loop that the host steers returns only when it is done: told one after
+    another, devices would work one after another (measured: four H200s as fast as one).
+    """
+    local = layout.shards.local
+
+    def act(i: int) -> tuple[list[dict[str, PyTree]], PyTree]:
+        device, numbers = layout.here[i]
+        learned, mine = on(device, state.learned), state.places[i * local : (i + 1) * local]
+        pairs = [
+            collects[i](learned, places, np.int32(number * layout.size))
+            for number, places in zip(numbers, mine, strict=True)
+        ]
+        return [places for places, _ in pairs], join([seen for _, seen in pairs])
+
+    places, experience = zip(*told_by.map(act, range(len(collects))), strict=True)
     learned, metrics = improve(state.learned, assemble(layout, SPLIT, experience))
-    return Spread(learned, tuple(places)), metrics
+    return Spread(learned, tuple(itertools.chain(*places))), metrics
 
 
 def compile_programs(
@@ -213,7 +226,9 @@ def compile_programs(
     judge = judging.result() if judging else judge
     return Programs(
         init=making.result() if making else make,
-        update=functools.partial(update, layout, collects, improve),
+        update=functools.partial(
+            update, layout, collects, improve, ThreadPoolExecutor(len(collects))
+        ),
         evaluate=lambda state: judge(on(device, state.learned)),
         seconds=seconds,
         unordered=sorted({*sums, *unordered(traced)}),
