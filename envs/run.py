@@ -26,7 +26,7 @@ from envs.bodies import ANT, RODENT, Body
 from envs.compose import Composed, compose
 from purerl import model as lookup
 from purerl.env import State
-from purerl.physics import Physics, PhysicsState
+from purerl.physics import Physics, PhysicsState, overflow_metric, overflow_reading
 from purerl.types import Array
 
 BODIES = {"ant": ANT, "rodent": RODENT}
@@ -167,6 +167,7 @@ class Run:
         terms = reward_terms(self.options, speed, center - before, healthy, action)
         metrics = {"forward_velocity": speed, "height": height, "up": up, "turn": turn}
         metrics |= {f"reward_{name}": term for name, term in terms.items()}
+        metrics |= overflow_metric(readings)
         task = task | {"center": center}
         finished = jnp.zeros((), bool)
         if "course" in task:
@@ -300,6 +301,7 @@ def build(options: Options = Options(), engine: str = "auto") -> Run:  # noqa: B
     model = parts.model
     joints = [lookup.names(model, "joint")[i] for i in parts.joints]
     readings = READINGS + (BODY_READINGS if options.observe_bodies else ())
+    readings += overflow_reading(engine)
     return Run(
         options=options,
         physics=Physics(model, readings, options.substeps, engine),

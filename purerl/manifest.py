@@ -38,6 +38,7 @@ def collect(
     """
     import jax
 
+    packages = PACKAGES + (["warp-lang"] if engine == "warp" else [])
     device = jax.devices()[0]
     about = {
         "platform": device.platform,
@@ -48,7 +49,7 @@ def collect(
     options = jax.config.values
     return (
         {
-            "versions": {"python": platform.python_version()} | {p: _version(p) for p in PACKAGES},
+            "versions": {"python": platform.python_version()} | {p: _version(p) for p in packages},
             "device": about,
             "num_shards": num_shards,
             "devices": jax.device_count() if num_shards > 1 else 1,

@@ -1,6 +1,7 @@
 """MuJoCo behind one small stateless interface, whatever the engine."""
 
 import collections
+import importlib.util
 from typing import Any
 
 import jax
@@ -98,10 +99,15 @@ class Physics:
     body `dof_M0` too, which the C code reads).
 
     A simulation that blows up, or is given NaN, returns NaN and touches no other.
+
+    On `warp` contacts and constraints have buffers of a fixed size, which may be too small: then
+    some were left out of a step, and the reading "overflow" ([], that engine's alone) is 1 and not
+    0. Of a Physics that does not read it, such a simulation has blown up. `overflow_reading` and
+    `overflow_metric` make a metric of it in one line each.
     """
 
     model: mujoco.MjModel
-    engine: str  # "c" or "jax"
+    engine: str  # "c", "jax" or "warp"
     substeps: int
     control_timestep: float  # substeps * model.opt.timestep [s]
 
@@ -118,16 +124,17 @@ class Physics:
           model: the compiled model.
           readings: names of derived `mujoco.MjData` fields, of `READINGS`.
           substeps: physics steps in one control step.
-          engine: "c" (MuJoCo on the CPU), "jax" (MJX), or "auto": "c" where JAX runs on a CPU.
+          engine: "c" (MuJoCo on the CPU), "jax" (MJX), "warp" (MJX-Warp), or "auto": "c" where JAX
+            runs on a CPU, else "jax".
 
         Raises:
           ValueError: an unknown engine or reading, or a model with state that is not carried.
         """
-        _check_model(model, readings)
+        self.engine = choose_engine(engine)
+        _check_model(model, tuple(n for n in readings if n not in overflow_reading(self.engine)))
         if substeps < 1:
             raise ValueError(f"substeps is {substeps}: a control step needs at least 1.")
         self.model, self.substeps = model, substeps
-        self.engine = choose_engine(engine)
         self.control_timestep = substeps * float(model.opt.timestep)
         record: Any = collections.namedtuple("Readings", list(readings))  # type: ignore[misc]
         self._engine = _build_engine(self.engine, model, record, substeps)
@@ -171,14 +178,25 @@ def choose_engine(engine: str) -> str:
     """Resolves "auto" and refuses what cannot run here."""
     if engine not in ENGINES:
         raise ValueError(unknown_name("engine", engine, ENGINES))
-    if engine == "warp":
+    if engine == "warp" and importlib.util.find_spec("warp") is None:
         raise ValueError(
-            "engine 'warp' (MJX-Warp) cannot run here: it needs an NVIDIA GPU and the warp-lang "
-            "package, and purerl does not drive it yet. Use 'jax' on a GPU, 'c' on a CPU."
+            "engine 'warp' (MJX-Warp) cannot run here: it needs the warp-lang package (pip install "
+            "-c constraints.txt -e '.[warp]') and an NVIDIA GPU. Or use 'jax' on a GPU, 'c' on a "
+            "CPU."
         )
     if engine == "auto":
         return "c" if jax.default_backend() == "cpu" else "jax"
     return engine
+
+
+def overflow_reading(engine: str) -> tuple[str, ...]:
+    """Returns the reading of left out contacts, for an engine that may leave some out."""
+    return ("overflow",) if choose_engine(engine) == "warp" else ()
+
+
+def overflow_metric(readings: Any) -> dict[str, Array]:
+    """Returns the metric of it, summed over an episode: control steps that lacked contacts."""
+    return {"overflow_count": readings.overflow} if hasattr(readings, "overflow") else {}
 
 
 def _build_engine(engine: str, model: mujoco.MjModel, record: Any, substeps: int) -> Any:
@@ -187,9 +205,13 @@ def _build_engine(engine: str, model: mujoco.MjModel, record: Any, substeps: int
         from purerl.engine_c import CEngine
 
         return CEngine(model, record, _stage(model, record._fields), substeps)
+    late = tuple(n for n in record._fields if n in _ACCELERATION or n == "sensordata")
+    if engine == "warp":
+        from purerl.engine_warp import WarpEngine
+
+        return WarpEngine(model, record, late, substeps)
     from purerl.engine_jax import JaxEngine
 
-    late = tuple(n for n in record._fields if n in _ACCELERATION or n == "sensordata")
     return JaxEngine(model, record, late, substeps)
 
 

@@ -230,8 +230,6 @@ def test_changes_are_each_environments_own(engine):
 def test_wrong_names_and_shapes_are_explained():
     with pytest.raises(ValueError, match="engine 'cpu'.*There are: auto, c, jax, warp"):
         choose_engine("cpu")
-    with pytest.raises(ValueError, match="NVIDIA"):
-        choose_engine("warp")
     with pytest.raises(ValueError, match="reading 'xpoz'. Did you mean 'xpos'"):
         Physics(biped(), ("xpoz",), engine="c")
     with pytest.raises(ValueError, match="sensors, and the model has them disabled"):
@@ -247,6 +245,12 @@ def test_wrong_names_and_shapes_are_explained():
         p.init(qpos, qvel, {"body_mass": jnp.ones(3)})
     with pytest.raises(ValueError, match=r"qvel has shape \(9,\)"):
         p.init(qpos, qpos, {})
+
+
+def test_an_engine_that_is_not_installed_is_told_how_to_be(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"warp-lang package \(pip install .*'\.\[warp\]'"):
+        choose_engine("warp")
 
 
 def test_look_ups_by_name():

@@ -373,7 +373,6 @@ def test_a_run_begun_under_other_conditions_lists_them(tmp_path, stop_after, cap
         (["--ppo.learning-rate", "fast"], "could not convert"),
         (["--ppo.num-steps", "31"], "num_steps is 31, less than one update"),
         (["--ppo.num-minibatches", "3"], "does not divide"),
-        (["--engine", "warp"], "warp"),
         (["--keep", "0"], "keep is 0"),
         (["--runs", "/dev/null/runs"], "cannot be written"),
     ],

@@ -11,7 +11,13 @@ import numpy as np
 
 from purerl import model as lookup
 from purerl.env import State
-from purerl.physics import Physics, PhysicsState, choose_engine
+from purerl.physics import (
+    Physics,
+    PhysicsState,
+    choose_engine,
+    overflow_metric,
+    overflow_reading,
+)
 from purerl.types import Array
 
 _JOINT = mujoco.mjtJoint
@@ -81,6 +87,7 @@ class SuiteEnv:
         """Observes and rewards a moment."""
         moment = Moment(physics, readings, ctrl)
         parts = {k: jnp.float32(v) for k, v in self.domain.reward(moment).items()}
+        parts |= overflow_metric(readings)
         return State(
             physics=physics,
             observation=self.domain.observe(moment).astype(jnp.float32),
@@ -134,6 +141,7 @@ def make_env(
 ) -> SuiteEnv:
     """Puts a domain on an engine; `control_timestep` [s] must be a multiple of the model's."""
     substeps = round(control_timestep / model.opt.timestep)
+    readings += overflow_reading(engine)
     return SuiteEnv(domain, Physics(model, readings, substeps, engine), model.nu)
 
 
