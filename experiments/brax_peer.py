@@ -1,21 +1,30 @@
-"""brax's PPO beside ours, on brax's own bodies with brax's published settings.
+"""brax's PPO beside ours, on brax's own bodies with brax's published settings: steps per second.
 
     python -m pip install -c constraints.txt -e '.[peers]'
-    python -m experiments.brax_peer ant --json ant.json
-    python -m experiments.brax_peer humanoid halfcheetah --backend mjx
+    python -m experiments.brax_peer ant humanoid --json rates.json
+    python -m experiments.brax_peer ant --trainers brax    # with XLA's own choice of kernels
 
-Both train the same environment (`envs/brax_env.py` brings brax's into our protocol) with the same
-networks, environments, samples, minibatches and epochs. The rates are those of training alone,
-compiled and without evaluation: of brax its own figure ("training/sps") between two evaluations, of
-ours whole updates one after another. What differs by design is what each does besides: brax takes
-advantages anew in every minibatch, ours draws a fresh start for each episode.
+Same observation, reward, end and start (brax's code, `envs/brax_env.py`), networks, environments,
+samples, minibatches and epochs; no evaluation and no checkpoint. Three lines of a table:
+
+    brax                      its own figure, "training/sps", between calls of its progress function
+    purerl on brax's physics  MJX as brax calls it, the whole `mjx.Data` carried from step to step
+    purerl                    the same MuJoCo model on purerl's physics, engine `jax`
+
+A line's physics alone is that physics under random actions, from the same starts, without
+observation, reward or network; brax's is that of the second line. What differs by design is what
+each trainer does besides: brax takes advantages anew in every minibatch, over short unrolls; ours
+draws a fresh start for each episode, and takes MJX's matrix products in whole float32.
+
+Whole training and its returns: `experiments/brax_training.py`.
 """
 
 import argparse
 import json
 import statistics
 import sys
-import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -24,10 +33,12 @@ import jax
 import jax.numpy as jnp
 
 from envs import brax_env
-from purerl import kernels, networks, ppo, rundir
+from experiments.benchmark import Part, measure
+from experiments.peers import Ours
+from purerl import compilation, kernels, networks, rundir
 from purerl.config import Config
-from purerl.experiment import Experiment
-from purerl.types import PyTree
+from purerl.experiment import Evaluation, Experiment
+from purerl.types import Array, PyTree
 
 
 @dataclass(frozen=True)
@@ -57,17 +68,29 @@ BODIES = {
     "humanoid": Published(2048, 10, 1024, 32, 8, 0.97, 3e-4, 1e-3, 0.1),
     "halfcheetah": Published(2048, 20, 512, 32, 8, 0.95, 3e-4, 1e-3, 1.0),
 }
+EPISODE_LENGTH = 1000
+NO_CLIPPING = 1e9  # of gradients: brax has none
 
 
 class Rate(NamedTuple):
-    """What was measured of one trainer."""
+    """What was measured of one trainer; control steps per second."""
 
     name: str
-    first_s: float  # from the start to the end of the first stretch, compiling included
-    steps_per_second: float  # median over the later stretches
+    physics: str
+    training: float
+    physics_alone: float | None  # None: not measured in this process
 
 
-def our_experiment(body: str, backend: str, sizes: Published, num_steps: int) -> Experiment:
+def resize(sizes: Published, num_envs: int) -> Published:
+    """Returns the settings for fewer environments, with as much fewer unrolls; 0: as they are."""
+    if not num_envs:
+        return sizes
+    return replace(
+        sizes, num_envs=num_envs, batch_size=sizes.batch_size * num_envs // sizes.num_envs
+    )
+
+
+def our_experiment(body: str, physics: str, sizes: Published, num_steps: int) -> Experiment:
     """Returns brax's settings under our names."""
     config = Config(
         num_steps=num_steps,
@@ -76,32 +99,64 @@ def our_experiment(body: str, backend: str, sizes: Published, num_steps: int) ->
         rollout_length=sizes.samples // sizes.num_envs,
         num_epochs=sizes.num_updates_per_batch,
         num_minibatches=sizes.num_minibatches,
+        episode_length=EPISODE_LENGTH,
         gamma=sizes.discounting,
         clip=0.3,
         entropy_weight=sizes.entropy_cost,
+        max_gradient_norm=NO_CLIPPING,
         learning_rate=sizes.learning_rate,
         reward_scale=sizes.reward_scaling,
     )
-    options: Any = brax_env.Options(name=body, backend=backend)  # type: ignore[arg-type]
+    options: Any = brax_env.Options(name=body, backend=physics)  # type: ignore[arg-type]
     network = networks.MlpOptions(policy_hidden=sizes.policy, value_hidden=sizes.value, std="state")
-    return Experiment(brax_env.build, options, networks.mlp, network, config)
+    return Experiment(brax_env.build, options, networks.mlp, network, config, engine="jax")
 
 
-def our_rate(chosen: Experiment, stretch: int, stretches: int) -> Rate:
-    """Times stretches of updates of our training; the first one compiles."""
-    begin = time.perf_counter()
+def physics_alone(env: Any, num_steps: int, start: PyTree, key: Array) -> Array:
+    """Steps the physics of B brax environments, [B] `start`; returns positions [B, nq].
+
+    Only positions are returned, so that what the next step does not need is not computed.
+    """
+    size = len(start.q), env.action_size
+
+    def step(physics: PyTree, t: Array) -> tuple[PyTree, None]:
+        action = jax.random.uniform(jax.random.fold_in(key, t), size, minval=-1.0, maxval=1.0)
+        return brax_env.plain(jax.vmap(env.step_physics)(physics, action)), None
+
+    return jax.lax.scan(step, start, jnp.arange(num_steps))[0].q
+
+
+def our_parts(chosen: Experiment) -> list[Part]:
+    """Compiles the physics alone and our training, side by side, and makes the first update."""
     config, env, network, _ = rundir.build(chosen)
-    state = jax.jit(partial(ppo.init, config, env, network))(jax.random.key(chosen.seed))
-    update = jax.jit(partial(ppo.update, config, env, network), donate_argnums=0)
-    ends = [time.perf_counter()]
-    for _ in range(stretches):
-        for _ in range(stretch):
-            state, metrics = update(state)
-        jax.device_get(metrics)
-        ends.append(time.perf_counter())
-    seconds = [b - a for a, b in zip(ends[1:-1], ends[2:], strict=True)]
-    rate = stretch * config.steps_per_update / statistics.median(seconds)
-    return Rate("purerl", ends[1] - begin, rate)
+    key = jax.random.key(chosen.seed)
+    abstract = compilation.abstract_state(config, env, network).env.physics
+    bare: Callable = partial(physics_alone, env, config.rollout_length)
+    compiling = compilation.start("physics alone", jax.jit(bare).trace(abstract, key), {})
+    programs = compilation.compile_programs(config, env, network, Evaluation(number=0), fresh=True)
+    alone, state = compiling.result(), programs.init(key)
+    # A copy: an update takes its state over.
+    start = jax.tree.map(jnp.copy, state.env.physics)
+    trainer = Ours(programs.update, state)
+    trainer()
+    return [
+        Part("physics alone", lambda: alone(start, key), config.steps_per_update, 0.0, 0),
+        Part("training", trainer, config.steps_per_update, 0.0, 0),
+    ]
+
+
+def our_rates(body: str, backend: str, sizes: Published, rounds: int) -> list[Rate]:
+    """Measures our training and the physics alone, on brax's physics and on ours."""
+    lines = {backend: "purerl on brax's physics", "purerl": "purerl"}
+    chosen = [our_experiment(body, physics, sizes, sizes.samples) for physics in lines]
+    with ThreadPoolExecutor() as pool:
+        found = list(pool.map(our_parts, chosen))
+    names = [f"{part.name}, {physics}" for physics, pair in zip(lines, found, strict=True)
+             for part in pair]  # fmt: skip
+    parts = [part._replace(name=name) for name, part in zip(names, sum(found, []), strict=True)]
+    rates = [timing.steps_per_second for timing in measure(parts, rounds, least_s=0.0)]
+    pairs = zip(lines.items(), rates[0::2], rates[1::2], strict=True)
+    return [Rate(name, physics, whole, bare) for (physics, name), bare, whole in pairs]
 
 
 def lend_removed_function() -> None:
@@ -113,59 +168,82 @@ def lend_removed_function() -> None:
     jax.__dict__.setdefault("device_put_replicated", replicate)
 
 
-def brax_rate(body: str, backend: str, sizes: Published, stretch: int, stretches: int) -> Rate:
-    """Times stretches of brax's own training; the first one compiles."""
+def train_brax(
+    body: str,
+    backend: str,
+    sizes: Published,
+    updates: int,
+    stretches: int,
+    progress: Callable[[int, dict[str, Any]], None],
+    num_episodes: int = 0,
+    seed: int = 0,
+) -> None:
+    """Runs brax's training.
+
+    Args:
+      body: brax's name of the environment.
+      backend: brax's name of its physics.
+      sizes: the settings.
+      updates: of one stretch, which is one call of a compiled program.
+      stretches: of the whole training.
+      progress: told (steps, metrics) after each stretch; with evaluations also before the first.
+      num_episodes: of each evaluation, of the deterministic policy; 0: no evaluations.
+      seed: brax's.
+    """
     from brax import envs
     from brax.training.agents.ppo import networks as brax_networks
     from brax.training.agents.ppo import train
 
     lend_removed_function()
-    times: list[float] = []
-    rates: list[float] = []
-
-    def progress(_: int, metrics: dict[str, Any]) -> None:
-        times.append(time.perf_counter())
-        rates.append(float(metrics.get("training/sps", 0.0)))
-
     names = "num_envs unroll_length batch_size num_minibatches num_updates_per_batch discounting"
     names += " learning_rate entropy_cost reward_scaling"
-    begin = time.perf_counter()
     train.train(
         environment=envs.get_environment(body, backend=backend),
-        num_timesteps=stretches * stretch * sizes.samples,
-        episode_length=1000,
+        num_timesteps=stretches * updates * sizes.samples,
+        episode_length=EPISODE_LENGTH,
         normalize_observations=True,
-        num_evals=stretches + 1,  # the first one is before training
-        num_eval_envs=1,
+        num_evals=stretches + 1,
+        num_eval_envs=num_episodes or 1,
+        run_evals=num_episodes > 0,
+        deterministic_eval=True,  # as our evaluations are
         network_factory=partial(
             brax_networks.make_ppo_networks,
             policy_hidden_layer_sizes=sizes.policy,
             value_hidden_layer_sizes=sizes.value,
         ),
         progress_fn=progress,
+        seed=seed,
         **{name: getattr(sizes, name) for name in names.split()},
     )
-    return Rate("brax", times[1] - begin, statistics.median(rates[2:]))
+
+
+def brax_rate(body: str, backend: str, sizes: Published, updates: int, stretches: int) -> Rate:
+    """Measures brax's training: the median of the stretches after its two compilations."""
+    rates: list[float] = []
+    train_brax(
+        body, backend, sizes, updates, stretches, lambda _, m: rates.append(m["training/sps"])
+    )
+    return Rate("brax", backend, statistics.median(rates[2:]), None)
+
+
+def share_physics(rates: list[Rate]) -> list[Rate]:
+    """Gives each rate without a physics alone that of another line on the same physics."""
+    known = {rate.physics: rate.physics_alone for rate in rates if rate.physics_alone}
+    return [rate._replace(physics_alone=known.get(rate.physics)) for rate in rates]
 
 
 def table(body: str, rates: list[Rate]) -> str:
-    """Formats one body; ratios are to brax, the first."""
-    lines = [f"| {body} | first stretch [s] | steps/s | ratio |", "|---|---|---|---|"]
+    """Formats one body."""
+    brax = next((rate.training for rate in rates if rate.name == "brax"), None)
+    lines = [f"| {body} | physics | steps/s | physics alone | share | times brax |"]
+    lines.append("|---|---|---|---|---|---|")
     for rate in rates:
-        ratio = rate.steps_per_second / rates[0].steps_per_second
-        lines.append(
-            f"| {rate.name} | {rate.first_s:.1f} | {rate.steps_per_second:,.0f} | {ratio:.2f} |"
-        )
+        alone = f"{rate.physics_alone:,.0f}" if rate.physics_alone else "not measured"
+        share = f"{rate.training / rate.physics_alone:.2f}" if rate.physics_alone else ""
+        ratio = f"{rate.training / brax:.2f}" if brax else ""
+        cells = (rate.name, rate.physics, f"{rate.training:,.0f}", alone, share, ratio)
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
-
-
-def compare(body: str, backend: str, sizes: Published, stretch: int, stretches: int) -> list[Rate]:
-    """Times brax, then ours."""
-    chosen = our_experiment(body, backend, sizes, stretches * stretch * sizes.samples)
-    return [
-        brax_rate(body, backend, sizes, stretch, stretches),
-        our_rate(chosen, stretch, stretches),
-    ]
 
 
 def main(arguments: list[str]) -> int:
@@ -174,25 +252,34 @@ def main(arguments: list[str]) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("bodies", nargs="+", choices=tuple(BODIES))
+    trainers = ("brax", "purerl")
+    parser.add_argument("--trainers", nargs="+", choices=trainers, default=trainers)
     parser.add_argument("--backend", default="mjx", help="brax's physics")
-    parser.add_argument("--stretch", type=int, default=10, help="updates in one timing")
-    parser.add_argument("--stretches", type=int, default=6, help="timings; the first compiles")
+    parser.add_argument("--updates", type=int, default=10, help="in one stretch of brax's")
+    parser.add_argument("--stretches", type=int, default=5, help="of brax's; two of them compile")
+    parser.add_argument("--rounds", type=int, default=10, help="updates timed of ours")
     parser.add_argument("--num-envs", type=int, default=0, help="0: as published; less for a try")
     parser.add_argument("--json", default="", help="also write the figures to this file")
     options = parser.parse_args(arguments)
-    kernels.fix_choice()  # before JAX starts; it holds for both trainers
-    found = {}
+    if options.stretches < 3:
+        parser.error(f"--stretches is {options.stretches}; two compile, so it takes at least 3.")
+    if "purerl" in options.trainers:
+        kernels.fix_choice()  # before JAX starts; it holds for all in this process
+    found: dict[str, list[dict]] = {}
     for body in options.bodies:
-        sizes = BODIES[body]
-        if options.num_envs:
-            size = sizes.batch_size * options.num_envs // sizes.num_envs
-            sizes = replace(sizes, num_envs=options.num_envs, batch_size=size)
-        rates = compare(body, options.backend, sizes, options.stretch, options.stretches)
+        sizes, rates = resize(BODIES[body], options.num_envs), []
+        if "brax" in options.trainers:
+            rates.append(brax_rate(body, options.backend, sizes, options.updates,
+                                   options.stretches))  # fmt: skip
+        if "purerl" in options.trainers:
+            rates += our_rates(body, options.backend, sizes, options.rounds)
+        rates = share_physics(rates)
         print(f"{table(body, rates)}\non {jax.devices()[0].device_kind}", flush=True)
         found[body] = [rate._asdict() for rate in rates]
-    if options.json:
-        with open(options.json, "w") as file:
-            json.dump({"device": jax.devices()[0].device_kind, "bodies": found}, file, indent=1)
+        if options.json:
+            with open(options.json, "w") as file:
+                device = jax.devices()[0].device_kind
+                json.dump({"device": device, "bodies": found}, file, indent=1)
     return 0
 
 

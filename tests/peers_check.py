@@ -131,3 +131,48 @@ def test_braxs_settings_make_the_same_update(body):
     assert sizes.batch_size * sizes.num_minibatches % sizes.num_envs == 0  # brax's own rule
     minibatch = config.samples_per_update // config.num_minibatches
     assert minibatch == sizes.batch_size * sizes.unroll_length
+
+
+@pytest.mark.parametrize("body", ["ant", "humanoid"])
+def test_braxs_body_moves_on_our_physics_as_on_braxs(body):
+    pytest.importorskip("brax", reason="needs the extra peers")
+    from envs import brax_env
+
+    ours, theirs = (
+        brax_env.build(brax_env.Options(body, physics), "jax") for physics in ("purerl", "mjx")
+    )
+    our_step, their_step = jax.jit(ours.step), jax.jit(theirs.step)
+    state, reached = (
+        jax.jit(ours.reset)(jax.random.key(0)),
+        jax.jit(theirs.reset)(jax.random.key(0)),
+    )
+    for i in range(20):
+        # From brax's state each time: contacts make the smallest difference grow.
+        names = ("qpos", "qvel", "qacc_warmstart")
+        same = {name: getattr(reached.physics, name) for name in names}
+        physics = state.physics.replace(physics=state.physics.physics.replace(**same))
+        action = 0.5 * jnp.sin(jnp.arange(ours.action_size) + i)
+        state = our_step(state.replace(physics=physics), action)
+        reached = their_step(reached, action)
+        np.testing.assert_allclose(state.physics.q, reached.physics.q, atol=1e-4)
+        np.testing.assert_allclose(state.physics.qd, reached.physics.qd, atol=1e-2)
+        # Links are those of another physics step, one later.
+        np.testing.assert_allclose(state.physics.x.pos, reached.physics.x.pos, atol=0.1)
+        np.testing.assert_allclose(state.physics.xd.vel, reached.physics.xd.vel, atol=1.0)
+        assert bool(state.terminated) == bool(reached.terminated)
+
+
+def test_a_training_has_braxs_number_of_updates():
+    """Brax rounds up to the same number of updates between any two evaluations."""
+    from experiments import brax_peer, brax_training
+
+    task = brax_training.make_task("ant", brax_peer.BODIES["ant"], 31_000_000, evaluations=6)
+    assert (task.stretches, task.updates, task.steps) == (5, 19, 31_129_600)
+
+
+def test_the_difference_of_returns_has_an_interval_from_five_seeds_on():
+    from experiments import brax_training
+
+    ours, theirs = np.arange(5.0) + 100, np.arange(5.0)
+    assert brax_training.difference(ours, theirs).startswith("100 [")
+    assert brax_training.difference(ours[:4], theirs) == "100, too few seeds"
