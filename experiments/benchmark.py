@@ -7,6 +7,7 @@
 Each part is compiled by itself and timed in rounds, part after part, so that a busy moment of the
 machine falls on all of them; the median of the rounds counts. Rates are control steps per second.
 "Physics alone" is the bare engine under random controls: no network, no reward, no observation.
+"Busy" is the share of the time in which a GPU ran a kernel: the rest are gaps, left by the host.
 
 Memory: the run's state; one update, its state and what the compiled program needs beside it; and
 the most that the device has held, where it counts, or else the process, everything included (the
@@ -18,22 +19,24 @@ import json
 import resource
 import statistics
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from experiments import start_up
-from purerl import cli, kernels, learner, ppo, run, rundir, targets
+from purerl import cli, kernels, learner, ppo, run, rundir
 from purerl.console import size
 from purerl.evaluation import evaluate
 from purerl.experiment import Experiment, find
 from purerl.model import scale_action
 from purerl.rollout import rollout
-from purerl.types import Array, PyTree, TrainState
+from purerl.types import Array, Network, PyTree, TrainState
 
 PARTS = ("physics alone", "rollout", "learner", "update", "evaluation")
 
@@ -63,6 +66,7 @@ class Timing(NamedTuple):
     compile_s: float
     seconds: float  # median of the rounds
     steps_per_second: float
+    busy: float | None = None  # share of the time in which a GPU ran a kernel
 
 
 def bare_physics(env: Any, config: ppo.Config, state: TrainState, key: Array) -> PyTree:
@@ -92,14 +96,14 @@ def make_bench(experiment: Experiment, names: Sequence[str] = PARTS) -> Bench:
     config, env, network, _ = rundir.build(experiment)
     key = jax.random.key(experiment.seed)
     state = jax.jit(partial(ppo.init, config, env, network))(key)
-    state, transitions, _, last = jax.jit(partial(rollout, config, env, network))(state)
-    first = state.episode.length == 0
-    batch = jax.jit(partial(targets.make_batch, config))(state, transitions, last, first)
+    seen = None
+    if "learner" in names:  # it needs something to learn from
+        state, seen = jax.jit(partial(ppo.collect, config, env, network))(state)
     steps, episodes = config.steps_per_update, experiment.evaluation.num_episodes
     programs: list[tuple[str, Callable, tuple, int | None]] = [
         ("physics alone", partial(bare_physics, env, config), (state, key), steps),
         ("rollout", partial(rollout, config, env, network), (state,), steps),
-        ("learner", partial(learner.learn, config, network), (state, batch, state.carry), steps),
+        ("learner", partial(learn, config, network), (state, seen), steps),
         ("update", partial(ppo.update, config, env, network), (state,), steps),
         (
             "evaluation",
@@ -112,6 +116,13 @@ def make_bench(experiment: Experiment, names: Sequence[str] = PARTS) -> Bench:
         programs = programs[1:]
     parts = [compile_part(*program) for program in programs if program[0] in names]
     return Bench(parts, state, config.num_envs)
+
+
+def learn(
+    config: ppo.Config, network: Network, state: TrainState, seen: ppo.Experience
+) -> tuple[TrainState, PyTree]:
+    """The learner alone, on one rollout's experience."""
+    return learner.learn(config, network, state, seen.batch, seen.memory)
 
 
 def compile_part(name: str, function: Callable, arguments: tuple, steps: int | None) -> Part:
@@ -138,8 +149,33 @@ def measure(parts: list[Part], rounds: int, least_s: float) -> list[Timing]:
             if part.steps is None:
                 steps[part.name] = int(result["episode_length"].sum())
     medians = {name: statistics.median(values) for name, values in samples.items()}
-    return [Timing(p.name, p.compile_s, medians[p.name], steps[p.name] / medians[p.name])
-            for p in parts]  # fmt: skip
+    return [
+        Timing(p.name, p.compile_s, medians[p.name], steps[p.name] / medians[p.name], busy(p))
+        for p in parts
+    ]
+
+
+def busy(part: Part) -> float | None:
+    """Returns the share of a call in which the GPU ran a kernel, None without a GPU.
+
+    What is missing to 1 are gaps: the GPU waits for the host to tell it what to do next.
+    """
+    if jax.default_backend() != "gpu":
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        with jax.profiler.trace(folder):
+            start = time.perf_counter()
+            jax.block_until_ready(part.call())
+            seconds = time.perf_counter() - start
+        file = next(Path(folder).rglob("*.xplane.pb"))
+        return kernel_seconds(jax.profiler.ProfileData.from_file(str(file)).planes) / seconds
+
+
+def kernel_seconds(planes: Iterable[Any]) -> float:
+    """Adds up the events on the GPUs' streams, of a profile's planes."""
+    gpus = [plane for plane in planes if plane.name.startswith("/device:GPU")]
+    streams = [line for plane in gpus for line in plane.lines if line.name.startswith("Stream")]
+    return sum(event.duration_ns for stream in streams for event in stream.events) * 1e-9
 
 
 def memory(bench: Bench) -> dict[str, int]:
@@ -167,12 +203,16 @@ def memory_table(found: dict[str, int], num_envs: int) -> str:
 
 def table(timings: list[Timing]) -> str:
     """Formats the timings, with each rate's share of the first part's."""
-    lines = ["| part | compile [s] | seconds | steps/s | share |", "|---|---|---|---|---|"]
+    lines = [
+        "| part | compile [s] | seconds | steps/s | share | busy |",
+        "|---|---|---|---|---|---|",
+    ]
     for t in timings:
         share = t.steps_per_second / timings[0].steps_per_second
+        kernels_run = "" if t.busy is None else f"{t.busy:.2f}"
         lines.append(
             f"| {t.name} | {t.compile_s:.1f} | {t.seconds:.4f} | {t.steps_per_second:,.0f} "
-            f"| {share:.2f} |"
+            f"| {share:.2f} | {kernels_run} |"
         )
     return "\n".join(lines)
 

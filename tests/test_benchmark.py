@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import sys
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -57,6 +58,20 @@ def test_rates_are_steps_over_median_seconds():
     assert timing.steps_per_second == pytest.approx(100 / timing.seconds)
 
 
+def test_only_kernels_on_the_gpus_streams_count_as_busy():
+    def line(name, *durations_ns):
+        return SimpleNamespace(
+            name=name, events=[SimpleNamespace(duration_ns=d) for d in durations_ns]
+        )
+
+    gpu = [line("Stream #1(Compute)", 10, 20), line("Stream #2(MemcpyD2H)", 5)]
+    planes = [
+        SimpleNamespace(name="/device:GPU:0", lines=[*gpu, line("XLA Modules", 1000)]),
+        SimpleNamespace(name="/host:CPU", lines=[line("Stream of thought", 7)]),
+    ]
+    assert benchmark.kernel_seconds(planes) == pytest.approx(35e-9)
+
+
 def test_a_rate_without_known_steps_counts_the_episodes():
     result = {"episode_length": np.array([3, 4])}
     part = benchmark.Part("evaluation", lambda: result, None, 0.0, 0)
@@ -65,8 +80,9 @@ def test_a_rate_without_known_steps_counts_the_episodes():
 
 
 def test_shares_are_of_the_first_part():
-    timings = [benchmark.Timing("a", 0, 1, 200.0), benchmark.Timing("b", 0, 1, 50.0)]
-    assert benchmark.table(timings).splitlines()[-1].endswith("| 0.25 |")
+    timings = [benchmark.Timing("a", 0, 1, 200.0), benchmark.Timing("b", 0, 1, 50.0, 0.5)]
+    *_, first, second = benchmark.table(timings).splitlines()
+    assert first.endswith("| 1.00 |  |") and second.endswith("| 0.25 | 0.50 |")
 
 
 def test_compile_times_are_read_from_a_runs_output():
