@@ -121,10 +121,13 @@ class WarpEngine:
         # One simulation may need all that the model allows; many have 128 each to share.
         number = min(size * self.contacts, max(self.contacts, size * MOST_CONTACTS))
         number = number if data._impl.njmax else 0
-        impl = {k: getattr(data._impl, k) for k in data._impl.__dataclass_fields__}
-        impl = {k: jnp.zeros((number, *v.shape[1:]), v.dtype) for k, v in impl.items()
-                if k.startswith("contact__")}  # fmt: skip
-        data = data.replace(_impl=data._impl.replace(**impl, naconmax=number, naccdmax=number))
+        impl = data._impl
+        buffers = {
+            k: getattr(impl, k) for k in impl.__dataclass_fields__ if k.startswith("contact__")
+        }
+        # Made while running: as constants they would be a part of the program.
+        buffers = {k: jnp.zeros((number, *v.shape[1:]), v.dtype) for k, v in buffers.items()}
+        data = data.replace(_impl=impl.replace(**buffers, naconmax=number, naccdmax=number))
 
         def load(state: PyTree, changes: dict[str, Array]) -> mjx.Data:
             return _place_static_geoms(self.model, _load(data, state), changes)
@@ -157,7 +160,7 @@ def room(model: mujoco.MjModel, on_device: mjx.Model) -> tuple[int, int]:
     contacts = int(_points(model.geom_type[pairs]).sum())
     pyramidal = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     each = impl.nmaxpyramid if pyramidal else impl.nmaxcondim
-    # A weld has 6 rows. MJX-Warp leaves the last 6 of the buffer unused by equalities, so 8 more.
+    # A weld has 6 rows. MJX-Warp drops an equality that would end where the buffer ends: 8 more.
     others = 6 * model.neq + model.nv + 2 * model.ntendon + model.njnt + 8
     rows = contacts * max(1, int(each)) + others
     return contacts, min(rows, MOST_ROWS)
