@@ -1,24 +1,33 @@
 """Keeps XLA from choosing kernels by timing them, so that every process computes with the same.
 
 On a GPU, XLA by default times several kernels for an operation and takes the fastest. Two processes
-may choose differently, and other kernels add in another order.
+may choose differently, and other kernels add in another order. Untimed, cuBLAS's own choice is good
+where a product is large enough (`learner.count_slices`); XLA's Triton kernels, of one untimed tile
+size, are not (a humanoid's physics 9%, a gradient step 40% slower; H100, jax 0.11.2).
 """
 
 import os
 
 LEVEL = "xla_gpu_autotune_level"
+TRITON = "xla_gpu_enable_triton_gemm"
 FIXING_FLAGS = (
     f"{LEVEL}=0",
     "xla_gpu_deterministic_ops=true",
     "xla_gpu_exclude_nondeterministic_ops=true",
 )
+# JAX keeps what XLA timed in an earlier process beside its own cache, and XLA takes it from there.
+KEPT_TIMINGS = "JAX_PERSISTENT_CACHE_ENABLE_XLA_CACHES"
 
 
 def fix_choice() -> None:
     """Turns the timing off, where XLA_FLAGS does not set it; to be called before JAX starts."""
     flags = os.environ.get("XLA_FLAGS", "")
     if not any(name.partition("=")[0] in flags for name in FIXING_FLAGS):
-        os.environ["XLA_FLAGS"] = f"{flags} --{LEVEL}=0".strip()
+        flags += f" --{LEVEL}=0"
+        if TRITON not in flags:
+            flags += f" --{TRITON}=false"
+        os.environ["XLA_FLAGS"] = flags.strip()
+        os.environ.setdefault(KEPT_TIMINGS, "none")
 
 
 def how_chosen(platform: str) -> str:

@@ -4,6 +4,8 @@ Clipped surrogate and value loss of Schulman et al. 2017 (arXiv:1707.06347), Ada
 rate that is constant, linear or steered by the policy's KL.
 """
 
+import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -13,7 +15,7 @@ import optax
 from purerl import losses
 from purerl.config import Config
 from purerl.keys import Purpose, derive
-from purerl.shards import WHOLE, Shards, move, numbers, total
+from purerl.shards import WHOLE, Shards, add_in_order, move, numbers, total
 from purerl.targets import Batch
 from purerl.types import Array, Metrics, Network, PolicyOutput, PyTree, TrainState
 
@@ -184,12 +186,15 @@ def minibatch_step(
     """One gradient step, skipped and counted if any of it is not finite."""
     scale = losses.advantage_scale(batch.advantage, batch.weight, shards)
 
-    def part(batch: Batch, memory: PyTree) -> tuple[tuple[Array, Metrics], PyTree]:
+    def gradient(batch: Batch, memory: PyTree) -> tuple[tuple[Array, Metrics], PyTree]:
         def objective(params: PyTree) -> tuple[Array, Metrics]:
             return loss(config, network, params, scale, batch, memory)
 
         return jax.value_and_grad(objective, has_aux=True)(learner.params)
 
+    rows, columns = batch.weight.shape[-2:]  # of one shard
+    number = count_slices(rows, columns, jax.default_backend())
+    part = functools.partial(in_slices, gradient, number)
     (objective, metrics), gradients = total(shards, part, batch, memory)
     norm = optax.tree.norm(gradients)
     sound = jnp.isfinite(objective) & jnp.isfinite(norm)
@@ -208,6 +213,32 @@ def minibatch_step(
     )
     skipped = 1.0 - sound.astype(jnp.float32)
     return learner, metrics | {"loss": objective, "gradient_norm": norm, "skipped": skipped}
+
+
+def count_slices(rows: int, columns: int, platform: str) -> int:
+    """Returns in how many slices a minibatch [rows, columns] is computed.
+
+    A weight's gradient is one sum over all samples. The kernel that a GPU takes by default, without
+    timing others, gives such a sum to few of its processors: 1.31 ms a gradient step, against 0.61
+    in 16 slices and 0.54 with kernels chosen by timing (H100, 10,240 samples, layers of 256).
+    """
+    if platform != "gpu":
+        return 1
+    fit = [n for n in (16, 8, 4, 2) if columns % n == 0 and rows * columns // n >= 256]
+    return fit[0] if fit else 1
+
+
+def in_slices(function: Callable, number: int, batch: Batch, memory: PyTree) -> PyTree:
+    """Returns the sum of `function` of slices of a minibatch [T', M'], computed side by side."""
+    if number == 1:
+        return function(batch, memory)
+
+    def cut(x: Array, axis: int) -> Array:
+        return x.reshape(*x.shape[:axis], number, -1, *x.shape[axis + 1 :])
+
+    batch = jax.tree.map(lambda x: cut(x, 1), batch)
+    memory = jax.tree.map(lambda x: cut(x, 0), memory)
+    return jax.tree.map(add_in_order, jax.vmap(function, (1, 0))(batch, memory))
 
 
 def next_rate(config: Config, rate: Array, kl: Array, sound: Array) -> Array:

@@ -68,18 +68,28 @@ def test_a_manifest_says_whether_the_run_is_exact_and_what_prevents_it(monkeypat
     assert warp["bit_exact"] is False and "warp" in warp["inexact_because"][0]
 
 
+FIXED = "--xla_gpu_autotune_level=0 --xla_gpu_enable_triton_gemm=false"
+
+
 @pytest.mark.parametrize(
     "users, after, chosen",
     [
-        (None, "--xla_gpu_autotune_level=0", "fixed"),
-        ("--xla_a=b", "--xla_a=b --xla_gpu_autotune_level=0", "fixed"),
+        (None, FIXED, "fixed"),
+        ("--xla_a=b", f"--xla_a=b {FIXED}", "fixed"),
+        (
+            "--xla_gpu_enable_triton_gemm=true",
+            "--xla_gpu_enable_triton_gemm=true --xla_gpu_autotune_level=0",
+            "fixed",
+        ),
         ("--xla_gpu_autotune_level=4", "--xla_gpu_autotune_level=4", "by timing"),
         ("--xla_gpu_deterministic_ops=true", "--xla_gpu_deterministic_ops=true", "fixed"),
     ],
 )
 def test_kernels_are_fixed_unless_the_user_wants_them_timed(monkeypatch, users, after, chosen):
     monkeypatch.setenv("XLA_FLAGS", users or "")
+    monkeypatch.delenv(kernels.KEPT_TIMINGS, raising=False)
     kernels.fix_choice()
+    assert (kernels.KEPT_TIMINGS in os.environ) == (after != users)
     assert os.environ["XLA_FLAGS"] == after
     assert kernels.how_chosen("gpu") == chosen and kernels.how_chosen("cpu") == "fixed"
     reasons = manifest.collect("jax", [], kernels.how_chosen("gpu"))["inexact_because"]

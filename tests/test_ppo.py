@@ -284,6 +284,39 @@ def test_a_lost_sample_has_no_weight_in_the_update():
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.parametrize("recurrent", [False, True])
+def test_a_gradient_in_slices_is_the_same_sum(monkeypatch, recurrent):
+    """As on a GPU: of 3 minibatches of 32 samples, or of 2 sequences, each in 2 slices."""
+    env, network, state = setup(recurrent=recurrent)
+    memory = state.carry  # before the rollout
+    after, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
+    batch = targets.make_batch(CONFIG, after, transitions, last_value, state.episode.length == 0)
+    whole, metrics = learner.learn(CONFIG, network, after, batch, memory)
+    asked = []
+    monkeypatch.setattr(learner, "count_slices", lambda *size: asked.append(size) or 2)
+    sliced, others = learner.learn(CONFIG, network, after, batch, memory)
+    assert asked == [(16, 2, "cpu") if recurrent else (1, 32, "cpu")]
+    for a, b in zip(jax.tree.leaves(whole.params), jax.tree.leaves(sliced.params), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4)
+    assert float(others["value_loss"]) == pytest.approx(float(metrics["value_loss"]), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "rows, columns, platform, number",
+    [
+        (1, 10240, "gpu", 16),
+        (1, 10240, "cpu", 1),
+        (1, 1024, "gpu", 4),  # 256 samples a slice at least
+        (1, 255, "gpu", 1),
+        (1, 5 * 512, "gpu", 8),
+        (32, 64, "gpu", 8),  # of sequences, whole ones
+        (32, 63, "gpu", 1),
+    ],
+)
+def test_slices_are_equal_and_not_too_small(rows, columns, platform, number):
+    assert learner.count_slices(rows, columns, platform) == number
+
+
 def test_a_non_finite_minibatch_is_skipped_and_counted():
     env, network, state = setup()
     _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
