@@ -33,7 +33,15 @@ class JaxEngine:
           record: the NamedTuple of readings.
           late: the readings that are those of the last substep.
           substeps: physics steps in one control step.
+
+        Raises:
+          ValueError: the model asks for the slip solver, which MJX leaves out without a word.
         """
+        if model.opt.noslip_iterations:
+            raise ValueError(
+                f"The model has noslip_iterations = {model.opt.noslip_iterations}, which MJX does "
+                "not have: set it to 0, on every engine, or use engine 'c'."
+            )
         self.record, self.late, self.substeps = record, late, substeps
         self.shapes = reading_shapes(model, record._fields)
         with _jax_defaults():

@@ -18,10 +18,9 @@ from purerl.physics import PhysicsState
 
 BUILDERS = {"ant": run.build, "cartpole": cartpole_swingup.build}
 NUMBER, STEPS = 4, 20
-# Of qpos over 20 control steps, and of the first observation. With the same contacts, the same
-# constraint rows and converged C, MJX's contact forces are 1 to 2% off at any number of iterations:
-# in float32 its line search stops early. Without contacts the engines agree to 1e-4.
-TOLERANCE = {"ant": 0.1, "cartpole": 1e-4}
+# Of qpos over 20 control steps. Where MJX's few solver iterations do not suffice in one step, the
+# simulations part there (with 20 and 50 iterations they do not).
+USUAL, WORST = {"ant": 1e-4, "cartpole": 1e-4}, {"ant": 0.02, "cartpole": 1e-4}
 
 
 @functools.cache
@@ -64,8 +63,9 @@ def test_contract(name, engine):
 @pytest.mark.parametrize("name", BUILDERS)
 def test_engines_agree(name):
     c, mjx = trajectory(name, "c"), trajectory(name, "jax")
-    np.testing.assert_allclose(c.physics.qpos, mjx.physics.qpos, atol=TOLERANCE[name])
-    np.testing.assert_allclose(c.observation[0], mjx.observation[0], atol=TOLERANCE[name])
+    error = jnp.abs(c.physics.qpos - mjx.physics.qpos).max((0, 2))  # of each simulation
+    assert jnp.median(error) < USUAL[name] and error.max() < WORST[name], error
+    np.testing.assert_allclose(c.observation[0], mjx.observation[0], atol=1e-3)
     assert float(jnp.abs(c.physics.qpos[-1] - c.physics.qpos[0]).max()) > 0.1  # something moved
 
 

@@ -237,6 +237,10 @@ def test_wrong_names_and_shapes_are_explained():
         Physics(biped(off), ("sensordata",), engine="c")
     with pytest.raises(ValueError, match="add one of accelerometer"):
         Physics(suite.load("cartpole", "swingup").physics.model.ptr, ("cfrc_ext",), engine="c")
+    slip = biped.__wrapped__()  # its own
+    slip.opt.noslip_iterations = 3
+    with pytest.raises(ValueError, match="noslip_iterations = 3, which MJX does not have: set it"):
+        Physics(slip, (), engine="jax")
     p = physics("c")
     qpos, qvel = (x[0] for x in starts(1, p.model))
     with pytest.raises(ValueError, match="Did you mean 'geom_friction'"):
