@@ -1,6 +1,7 @@
 """A run's programs: its beginning, an update, the evaluation.
 
-They are compiled at the same time: XLA does not hold Python's lock. With the `c` engine an update
+They are compiled at the same time, since XLA does not hold Python's lock; the evaluation after the
+others, while the run already trains. With the `c` engine an update
 is two programs, because JAX's cache refuses one with a call to the host: so the half that learns is
 compiled once, not at every start. With MJX it is one: acting alone, 256 ants on two cores, never
 ended (all of XLA's threads waiting, jax 0.10.2), where the whole update does.
@@ -8,8 +9,8 @@ ended (all of XLA's threads waiting, jax 0.10.2), where the whole update does.
 
 import functools
 import time
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, NamedTuple
 
 import jax
@@ -32,7 +33,7 @@ class Programs(NamedTuple):
     init: Callable[[Array], TrainState]
     update: Callable[[Any], tuple[Any, Metrics]]
     evaluate: Callable[[Any], Metrics]
-    seconds: dict[str, float]  # that each took to compile, side by side
+    seconds: dict[str, float]  # that each took to compile, side by side; without the evaluation
     unordered: list[str]  # sums of the update whose order nothing fixes on a GPU
     spread: Callable[[TrainState], Any] = lambda state: state  # onto the devices, for the others
     fetch: Callable[[Any], TrainState] = lambda state: state  # back onto one
@@ -80,12 +81,14 @@ def compile_programs(
     begin: Any = jax.jit(init)
     evaluate: Any = jax.jit(judge)
     beginning = start("init", begin.trace(key), seconds) if fresh else None
-    judging = start("evaluation", evaluate.trace(abstract), seconds) if evaluation.number else None
+    if evaluation.number:
+        first = [*started, beginning] if beginning else started
+        evaluate = when_ready(start("evaluation", evaluate.trace(abstract), {}, first))
     compiled = [part.result() for part in started]
     return Programs(
         init=beginning.result() if beginning else begin,
         update=functools.partial(update, *compiled) if calls_host else compiled[0],
-        evaluate=judging.result() if judging else evaluate,
+        evaluate=evaluate,
         seconds=seconds,
         unordered=sorted({place for part in traced for place in unordered(part)}),
     )
@@ -103,13 +106,20 @@ def shapes(tree: PyTree, sharding: Any = None) -> PyTree:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), tree)
 
 
-def start(name: str, traced: Any, seconds: dict[str, float]) -> Future[Any]:
-    """Compiles a traced program in a thread of its own, and notes how many seconds it took."""
+def start(
+    name: str, traced: Any, seconds: dict[str, float], first: Sequence[Future[Any]] = ()
+) -> Future[Any]:
+    """Compiles a traced program in a thread of its own, and notes how many seconds it took.
+
+    After the programs `first`, if there are any: what is needed later must not slow what is needed
+    now. It then may end while the run trains.
+    """
     begin = time.perf_counter()
-    lowered = traced.lower()
+    lowered = None if first else traced.lower()
 
     def compile_it() -> Any:
-        compiled = lowered.compile()
+        wait(first)
+        compiled = (lowered or traced.lower()).compile()
         seconds[name] = time.perf_counter() - begin
         return compiled
 
@@ -117,6 +127,11 @@ def start(name: str, traced: Any, seconds: dict[str, float]) -> Future[Any]:
     future = pool.submit(compile_it)
     pool.shutdown(wait=False)
     return future
+
+
+def when_ready(program: Future[Any]) -> Callable[..., Any]:
+    """Returns a function that calls a program, and before waits until it is compiled."""
+    return lambda *arguments: program.result()(*arguments)
 
 
 def unordered(traced: Any) -> list[str]:

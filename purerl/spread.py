@@ -19,7 +19,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
 from purerl import ppo
-from purerl.compilation import Programs, shapes, start, unordered
+from purerl.compilation import Programs, shapes, start, unordered, when_ready
 from purerl.config import Config
 from purerl.env import Env
 from purerl.evaluation import evaluate_in_run
@@ -218,12 +218,13 @@ def compile_programs(
         functools.partial(judge_policy, config, env, network, evaluation.num_episodes, abstract)
     )
     here = shapes(learned, SingleDeviceSharding(device))
-    judging = start("evaluation", judge.trace(here), seconds) if evaluation.number else None
     make: Any = jax.jit(init)
     making = start("init", make.trace(key), seconds) if fresh else None
+    if evaluation.number:
+        first = [improving, making] if making else [improving]
+        judge = when_ready(start("evaluation", judge.trace(here), {}, first))
     improve = improving.result()
     seconds["update"] = time.perf_counter() - begin
-    judge = judging.result() if judging else judge
     return Programs(
         init=making.result() if making else make,
         update=functools.partial(
