@@ -44,7 +44,7 @@ class JaxEngine:
             )
         self.record, self.late, self.substeps = record, late, substeps
         self.shapes = reading_shapes(model, record._fields)
-        with _jax_defaults():
+        with mjx_defaults():
             self.model = mjx.put_model(model, impl="jax")
             self.data = mjx.make_data(model, impl="jax")
         self._traces: dict[Any, core.ClosedJaxpr] = {}
@@ -81,34 +81,34 @@ class JaxEngine:
         leaves, structure = jax.tree.flatten(shapes)
         key = (function.__name__, structure, tuple((s.shape, s.dtype) for s in leaves))
         if key not in self._traces:
-            with _jax_defaults():
+            with mjx_defaults():
                 self._traces[key] = trace_deterministic(function, *shapes)
         return self._traces[key]
 
     def _init(self, state: PyTree, changes: dict[str, Array]) -> list[Array]:
         model = self.model.tree_replace(changes) if changes else self.model
-        data = _forward(model, _load(self.data, state), bool(self.late))
+        data = _forward(model, load_state(self.data, state), bool(self.late))
         return self._read(data)
 
     def _step(self, state: PyTree, ctrl: Array, changes: dict[str, Array]) -> list[Array]:
         model = self.model.tree_replace(changes) if changes else self.model
 
         def substep(carry, _):
-            data = _load(self.data, carry[0]).replace(ctrl=ctrl)
+            data = load_state(self.data, carry[0]).replace(ctrl=ctrl)
             after = mjx.step(model, data)
             late = _forward(model, data, True) if self.late and _forgets_sensors(data) else after
-            return (_save(carry[0], after), [_field(late, n) for n in self.late]), None
+            return (save_state(carry[0], after), [field_of(late, n) for n in self.late]), None
 
-        start = [jnp.zeros(_field(self.data, n).shape) for n in self.late]
+        start = [jnp.zeros(field_of(self.data, n).shape) for n in self.late]
         (state, late), _ = jax.lax.scan(substep, (state, start), None, self.substeps)
-        data = _load(self.data, state).tree_replace(
+        data = load_state(self.data, state).tree_replace(
             {_place(n): v for n, v in zip(self.late, late, strict=True)}
         )
         return jax.tree.leaves(state) + self._read(_kinematics(model, data))
 
     def _read(self, data: mjx.Data) -> list[Array]:
         fields = self.record._fields
-        return [jnp.reshape(_field(data, n), self.shapes[n]).astype(jnp.float32) for n in fields]
+        return [jnp.reshape(field_of(data, n), self.shapes[n]).astype(jnp.float32) for n in fields]
 
 
 def reading_shapes(model: mujoco.MjModel, names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
@@ -119,7 +119,7 @@ def reading_shapes(model: mujoco.MjModel, names: tuple[str, ...]) -> dict[str, t
     return {n: (s[0], 3, 3) if n in matrices else s for n, s in shapes.items()}
 
 
-def _jax_defaults() -> contextlib.ExitStack:
+def mjx_defaults() -> contextlib.ExitStack:
     """MJX relies on implicit promotion: its tracing is exempt from a caller's stricter rules.
 
     Its matrix products are whole float32 ones: a GPU's default has 10 bits of mantissa (TF32).
@@ -136,16 +136,17 @@ def _place(name: str) -> str:
     return f"_impl.{name}" if name in _IN_IMPL else name
 
 
-def _field(data: mjx.Data, name: str) -> Array:
+def field_of(data: mjx.Data, name: str) -> Array:
+    """Returns a field of `mjx.Data`, wherever it is kept."""
     return getattr(data._impl if name in _IN_IMPL else data, name)
 
 
-def _load(data: mjx.Data, state: PyTree) -> mjx.Data:
+def load_state(data: mjx.Data, state: PyTree) -> mjx.Data:
     """Puts an integration state into a blank `mjx.Data`."""
     return data.replace(**{name: getattr(state, name) for name in state.__dataclass_fields__})
 
 
-def _save(state: PyTree, data: mjx.Data) -> PyTree:
+def save_state(state: PyTree, data: mjx.Data) -> PyTree:
     """Takes the integration state out of an `mjx.Data`."""
     return state.replace(**{name: getattr(data, name) for name in state.__dataclass_fields__})
 

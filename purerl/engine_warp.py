@@ -27,12 +27,12 @@ from mujoco.mjx.third_party.mujoco_warp import OverflowType  # noqa: E402
 from mujoco.mjx.warp.types import _BATCH_DIM  # noqa: E402
 
 from purerl.engine_jax import (  # noqa: E402
-    _field,
-    _jax_defaults,
-    _load,
-    _save,
+    field_of,
+    load_state,
     mjx,
+    mjx_defaults,
     reading_shapes,
+    save_state,
 )
 from purerl.model import unknown_name  # noqa: E402
 from purerl.types import Array, PyTree  # noqa: E402
@@ -69,7 +69,7 @@ class WarpEngine:
         self.late_sensors = _late_sensors(model)
         self.massless = model.body_subtreemass < mujoco.mjMINVAL
         free = _unconstrained(model, "sensordata" in names)
-        with _jax_defaults():
+        with mjx_defaults():
             self.model, self.free = _put_model(model), _put_model(free)
             self.contacts, self.rows = room(model, self.model)
             self.data = mjx.make_data(model, impl="warp", naconmax=0, njmax=self.rows)
@@ -108,7 +108,7 @@ class WarpEngine:
         lost = ~_finite(state.time.shape[0], (state, ctrl, changes))
         if "overflow" not in self.record._fields:
             lost |= dropped  # nobody looks
-        state = jax.vmap(_lose)(lost, _save(state, data))
+        state = jax.vmap(_lose)(lost, save_state(state, data))
         return state, self._read(self._now(state, changes), data, dropped.astype(jnp.float32))
 
     def _now(self, state: PyTree, changes: dict[str, Array]) -> mjx.Data:
@@ -130,7 +130,7 @@ class WarpEngine:
         data = data.replace(_impl=impl.replace(**buffers, naconmax=number, naccdmax=number))
 
         def load(state: PyTree, changes: dict[str, Array]) -> mjx.Data:
-            return _place_static_geoms(self.model, _load(data, state), changes)
+            return _place_static_geoms(self.model, load_state(data, state), changes)
 
         return jax.vmap(load)(state, changes)
 
@@ -138,7 +138,7 @@ class WarpEngine:
         """Returns the readings of a batch: those of the last substep, the others from `now`."""
         found = {"overflow": dropped}
         for name, shape in self.shapes.items():
-            value = _field(last if name in self.late else now, name)
+            value = field_of(last if name in self.late else now, name)
             if name == "sensordata":
                 value = jnp.where(self.late_sensors, value, now.sensordata)
             if name == "subtree_com":  # MuJoCo's, where there is no mass; MJX-Warp has zero there
@@ -265,7 +265,7 @@ def _over_batch(function: Callable, axes: int = 0) -> Callable:
         lead = args[0].time.shape
         number = math.prod(lead)
         flat = jax.tree.map(lambda x: x.reshape(number, *x.shape[axes:]), args)
-        with _jax_defaults():
+        with mjx_defaults():
             out = function(*flat)
         return jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), out)
 
