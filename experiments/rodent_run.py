@@ -3,7 +3,7 @@
 python -m purerl.run rodent_run
 
 Expected: 1.2 m/s over whole 10 s episodes, head first, after 1.6 M steps: 3 min on 14 cores of a
-Xeon (measured), some 8 on two (3,700 steps/s).
+Xeon.
 """
 
 from envs import run

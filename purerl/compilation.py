@@ -1,10 +1,10 @@
 """A run's programs: its beginning, an update, the evaluation.
 
 They are compiled at the same time, since XLA does not hold Python's lock; the evaluation after the
-others, while the run already trains. With the `c` engine an update
-is two programs, because JAX's cache refuses one with a call to the host: so the half that learns is
-compiled once, not at every start. With MJX it is one: acting alone, 256 ants on two cores, never
-ended (all of XLA's threads waiting, jax 0.10.2), where the whole update does.
+others, while the run already trains. With the `c` engine an update is two programs, because JAX's
+cache refuses one with a call to the host: so the half that learns is compiled once, not at every
+start. With MJX it is one: acting alone, 256 ants on two cores, never ended (all of XLA's threads
+waiting, jax 0.10.2), where the whole update does.
 """
 
 import functools
@@ -83,13 +83,13 @@ def compile_programs(
     beginning = start("init", begin.trace(key), seconds) if fresh else None
     if evaluation.number:
         first = [*started, beginning] if beginning else started
-        evaluate = when_ready(start("evaluation", evaluate.trace(abstract), {}, first))
+        evaluate = when_ready(start("evaluation", evaluate.trace(abstract), seconds, first))
     compiled = [part.result() for part in started]
     return Programs(
         init=beginning.result() if beginning else begin,
         update=functools.partial(update, *compiled) if calls_host else compiled[0],
         evaluate=evaluate,
-        seconds=seconds,
+        seconds=dict(seconds),  # the evaluation's comes later
         unordered=sorted({place for part in traced for place in unordered(part)}),
     )
 

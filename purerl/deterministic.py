@@ -167,7 +167,7 @@ def _apply(eqn: core.JaxprEqn, inputs: list, known: list[Known], shared: dict) -
     name = eqn.primitive.name
     if _is_unordered(eqn):
         return [ordered_scatter(eqn, inputs, known)]
-    if not _has_scatter_sum(eqn) and (name != "while" or rounds(eqn.params, known) is None):
+    if name != "while" and not _has_scatter_sum(eqn):
         return bind_equation(eqn, inputs)
     if name in CALLS:
         return _evaluate(called_jaxpr(eqn), known, shared, *inputs)

@@ -3,7 +3,7 @@
 On a GPU, XLA by default times several kernels for an operation and takes the fastest. Two processes
 may choose differently, and other kernels add in another order. Untimed, cuBLAS's own choice is good
 where a product is large enough (`learner.count_slices`); XLA's Triton kernels, of one untimed tile
-size, are not (a humanoid's physics 9%, a gradient step 40% slower; H100, jax 0.11.2).
+size, are not (slower: a humanoid's physics by 9%, a gradient step by half; H100, jax 0.11.2).
 """
 
 import os

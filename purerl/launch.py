@@ -31,7 +31,7 @@ from purerl import (
 from purerl.config import Config
 from purerl.distributed import alone
 from purerl.errors import RunError, UserError
-from purerl.experiment import Experiment, Source
+from purerl.experiment import Evaluation, Experiment, Source
 from purerl.loggers import BackgroundLogger, Say, TensorBoardSink, WandbSink, check_installed
 from purerl.recorder import Recorder
 from purerl.run_video import RunVideo
@@ -91,12 +91,7 @@ def execute(
 
     @functools.cache
     def programs() -> compilation.Programs:
-        if shards.number > 1:
-            made = spread.compile_programs(*setup[:3], chosen.evaluation, fresh, shards)
-        else:
-            made = compilation.compile_programs(
-                *setup[:3], chosen.evaluation, fresh, vmapped, setup.engine == "c"
-            )
+        made = compile_programs(setup, chosen.evaluation, fresh, vmapped, shards)
         if platform == "gpu" and distributed.is_first():
             reasons = manifest.inexact_because(setup.engine, chosen_by, made.unordered)
             for folder in runs:
@@ -113,6 +108,16 @@ def execute(
             failed.append(str(error))
     if failed:
         raise RunError(" ".join(failed))
+
+
+def compile_programs(
+    setup: rundir.Setup, evaluation: Evaluation, fresh: bool, vmapped: int, shards: Shards
+) -> compilation.Programs:
+    """Compiles what the run calls: on one device, or on those that share the shards."""
+    if shards.number > 1:
+        return spread.compile_programs(*setup[:3], evaluation, fresh, shards)
+    calls_host = setup.engine == "c"
+    return compilation.compile_programs(*setup[:3], evaluation, fresh, vmapped, calls_host)
 
 
 def shards_on_disk(folders: Iterable[Path]) -> int:

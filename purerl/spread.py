@@ -222,7 +222,7 @@ def compile_programs(
     making = start("init", make.trace(key), seconds) if fresh else None
     if evaluation.number:
         first = [improving, making] if making else [improving]
-        judge = when_ready(start("evaluation", judge.trace(here), {}, first))
+        judge = when_ready(start("evaluation", judge.trace(here), seconds, first))
     improve = improving.result()
     seconds["update"] = time.perf_counter() - begin
     return Programs(
@@ -231,7 +231,7 @@ def compile_programs(
             update, layout, collects, improve, ThreadPoolExecutor(len(collects))
         ),
         evaluate=lambda state: judge(on(device, state.learned)),
-        seconds=seconds,
+        seconds=dict(seconds),  # the evaluation's comes later
         unordered=sorted({*sums, *unordered(traced)}),
         spread=functools.partial(spread, layout),
         fetch=functools.partial(fetch, layout),

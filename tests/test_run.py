@@ -1,5 +1,6 @@
 """The run command: the same bits however it is interrupted, and one line for every mistake."""
 
+import importlib.util
 import json
 import os
 import shutil
@@ -383,6 +384,15 @@ def test_a_mistake_is_one_line(tmp_path, capsys, words, message):
     import re
 
     assert re.search(message, said), said
+    assert not (tmp_path / "toy_experiment").exists()
+
+
+def test_an_engine_that_is_not_installed_is_one_line(tmp_path, capsys, monkeypatch):
+    found = importlib.util.find_spec
+    absent = lambda name, *of: None if name == "warp" else found(name, *of)  # noqa: E731
+    monkeypatch.setattr("importlib.util.find_spec", absent)
+    said = refused(capsys, start(tmp_path, "--engine", "warp"))
+    assert len(said.strip().splitlines()) == 1 and "warp" in said
     assert not (tmp_path / "toy_experiment").exists()
 
 
