@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from purerl.errors import FAILURE, UserError
+from purerl.errors import FAILURE, UserError, leave
 
 
 @dataclass(frozen=True)
@@ -255,4 +255,4 @@ def plot(path: Path, curves: Sequence[Any], metric: str) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main)

@@ -1,7 +1,11 @@
 """Errors that a person can act on: one line, no traceback, and an exit code."""
 
 import difflib
-from collections.abc import Iterable
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterable
+from typing import NoReturn
 
 SUCCESS = 0
 FAILURE = 1  # the run could not go on: non-finite numbers, a disk that refuses the last checkpoint
@@ -40,3 +44,17 @@ def one_line(error: BaseException) -> str:
     """Returns an exception as one line of text, with its class where the message alone is bare."""
     text = " ".join(str(error).split())
     return text if len(text) > 20 else f"{type(error).__name__}: {text}"
+
+
+def leave(command: Callable[[], int]) -> NoReturn:
+    """Ends the process with a command's exit code; in silence when its reader has left (`| head`).
+
+    The code is then the one of a program that SIGPIPE ended.
+    """
+    try:
+        code = command()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more
+        code = 128 + signal.SIGPIPE
+    sys.exit(code)

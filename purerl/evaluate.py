@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from purerl.errors import UserError
+from purerl.errors import UserError, leave
 
 
 @dataclass(frozen=True)
@@ -122,4 +122,4 @@ def write(path: Path, result: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main)

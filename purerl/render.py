@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from purerl.errors import RunError, UserError, one_line
+from purerl.errors import RunError, UserError, leave, one_line
 
 SHEET = 4  # rows and columns of the contact sheet
 SHEET_WIDTH = 320  # of each of its images [pixels]
@@ -225,4 +225,4 @@ def describe(run: Any, recording: Any) -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main)

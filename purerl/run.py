@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from purerl import experiment, kernels
-from purerl.errors import USAGE, RunError, StoppedError, UserError
+from purerl.errors import USAGE, RunError, StoppedError, UserError, leave
 from purerl.experiment import Experiment, Source
 
 
@@ -188,4 +188,4 @@ def stop_signals() -> Any:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main)

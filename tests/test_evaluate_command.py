@@ -1,6 +1,9 @@
 """`python -m purerl.evaluate RUN` works from the run's folder alone."""
 
 import json
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -69,3 +72,11 @@ def test_settings_that_do_not_fit_the_file_are_named(trained, tmp_path, capsys):
     (copy / "config.json").write_text(json.dumps(settings))
     assert evaluate.main([str(copy)]) == USAGE
     assert "env.gravity" in capsys.readouterr().err
+
+
+def test_it_leaves_in_silence_when_its_reader_has(trained):
+    command = [sys.executable, "-m", "purerl.evaluate", str(trained), "--episodes", "2"]
+    ended = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    ended.stdout.close()  # as `| head` does
+    assert ended.stderr.read() == b""
+    assert ended.wait() == 128 + signal.SIGPIPE
