@@ -1,17 +1,17 @@
 """A run's programs: its beginning, an update, the evaluation.
 
-They are compiled at the same time, since XLA does not hold Python's lock; where cores are few the
-evaluation after the others, while the run already trains. With the `c` engine an update is two
-programs, because JAX's cache refuses one with a call to the host: so the half that learns is
-compiled once, not at every start. With MJX it is one: acting alone, 256 ants on two cores, never
-ended (all of XLA's threads waiting, jax 0.10.2), where the whole update does.
+They are compiled at the same time, since XLA does not hold Python's lock; where cores are few, the
+evaluation when it is first needed. With the `c` engine an update is two programs, because JAX's
+cache refuses one with a call to the host: so the half that learns is compiled once, not at every
+start. With MJX it is one: acting alone, 256 ants on two cores, never ended (all of XLA's threads
+waiting, jax 0.10.2), where the whole update does.
 """
 
 import functools
 import os
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -24,9 +24,13 @@ from purerl.evaluation import evaluate_in_run
 from purerl.experiment import Evaluation
 from purerl.types import Array, Metrics, Network, PyTree, TrainState
 
-# Two cores come to an ant's first update a second sooner without the evaluation's compiling beside
-# it (9.6 s, `c`); 16 to its first evaluation on a GPU in 22 s with it, in 39 s without.
+# Compiling takes all of few cores, so that the first update waits for whatever is not needed yet;
+# 16 came to a training's first evaluation on a GPU in 22 s with all side by side, in 39 s else.
 FEW_CORES = 7
+# LLVM's level on a CPU, 3 elsewhere: what runs once, or is compiled at every start, shall be ready
+# soon. For an ant, `c`, `init` takes 1.5 s of a core instead of 3.3; `collect` 3.9 instead of 4.7
+# and is as fast (at level 0 it takes 2.4, and is slower by 8%).
+LEVELS = {"init": 0, "collect": 1}
 
 
 class Programs(NamedTuple):
@@ -87,8 +91,7 @@ def compile_programs(
     evaluate: Any = jax.jit(judge)
     beginning = start("init", begin.trace(key), seconds) if fresh else None
     if evaluation.number:
-        first = [*started, beginning] if beginning else started
-        evaluate = when_ready(start("evaluation", evaluate.trace(abstract), seconds, first))
+        evaluate = when_needed("evaluation", evaluate, abstract, seconds)
     compiled = [part.result() for part in started]
     return Programs(
         init=beginning.result() if beginning else begin,
@@ -111,22 +114,12 @@ def shapes(tree: PyTree, sharding: Any = None) -> PyTree:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), tree)
 
 
-def start(
-    name: str, traced: Any, seconds: dict[str, float], first: Sequence[Future[Any]] = ()
-) -> Future[Any]:
-    """Compiles a traced program in a thread of its own, and notes how many seconds it took.
-
-    On few cores after the programs `first`: what is needed later must not slow what is needed now.
-    It then may end while the run trains.
-    """
-    begin = time.perf_counter()
-    waits = bool(first) and len(os.sched_getaffinity(0)) <= FEW_CORES
-    lowered = None if waits else traced.lower()
+def start(name: str, traced: Any, seconds: dict[str, float]) -> Future[Any]:
+    """Compiles a traced program in a thread of its own, and notes how many seconds it took."""
+    begin, lowered = time.perf_counter(), traced.lower()
 
     def compile_it() -> Any:
-        if waits:
-            wait(first)
-        compiled = (lowered or traced.lower()).compile()
+        compiled = lowered.compile(compiler_options=compiler_options(name))
         seconds[name] = time.perf_counter() - begin
         return compiled
 
@@ -136,8 +129,20 @@ def start(
     return future
 
 
-def when_ready(program: Future[Any]) -> Callable[..., Any]:
-    """Returns a function that calls a program, and before waits until it is compiled."""
+def compiler_options(name: str) -> dict[str, int] | None:
+    """Returns XLA's options for a program of that name."""
+    if name not in LEVELS or jax.default_backend() != "cpu":
+        return None
+    return {"xla_backend_optimization_level": LEVELS[name]}
+
+
+def when_needed(
+    name: str, function: Any, example: PyTree, seconds: dict[str, float]
+) -> Callable[..., Any]:
+    """Returns a jitted function, compiled beside the others, or on few cores when it is called."""
+    if len(os.sched_getaffinity(0)) <= FEW_CORES:
+        return function
+    program = start(name, function.trace(example), seconds)
     return lambda *arguments: program.result()(*arguments)
 
 

@@ -163,15 +163,23 @@ def imported_files(names: Iterable[str]) -> dict[str, Path]:
 
 
 def _module_file(name: str) -> Path | None:
-    """Returns a module's Python file; None for what is no module, such as an imported function."""
+    """Returns a module's Python file; None for what is no module, such as an imported function.
+
+    Imports nothing: `find_spec` of a dotted name would import the module before the dot, and with
+    that of an engine all of MJX or Warp.
+    """
     if name in sys.modules:
         file = getattr(sys.modules[name], "__file__", None)
         return Path(file) if file else None
-    try:
-        spec = importlib.util.find_spec(name)
-    except ModuleNotFoundError:
+    package, *inside = name.split(".")
+    spec = importlib.util.find_spec(package)
+    if spec is None:
         return None
-    return Path(spec.origin) if spec is not None and spec.has_location and spec.origin else None
+    if not inside:
+        return Path(spec.origin) if spec.has_location and spec.origin else None
+    places = [Path(place, *inside) for place in spec.submodule_search_locations or ()]
+    files = [file for place in places for file in (place / "__init__.py", place.with_suffix(".py"))]
+    return next((file for file in files if file.is_file()), None)
 
 
 def _imports(file: Path) -> list[str]:

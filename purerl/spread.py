@@ -19,7 +19,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
 from purerl import ppo
-from purerl.compilation import Programs, shapes, start, unordered, when_ready
+from purerl.compilation import Programs, shapes, start, unordered, when_needed
 from purerl.config import Config
 from purerl.env import Env
 from purerl.evaluation import evaluate_in_run
@@ -221,8 +221,7 @@ def compile_programs(
     make: Any = jax.jit(init)
     making = start("init", make.trace(key), seconds) if fresh else None
     if evaluation.number:
-        first = [improving, making] if making else [improving]
-        judge = when_ready(start("evaluation", judge.trace(here), seconds, first))
+        judge = when_needed("evaluation", judge, here, seconds)
     improve = improving.result()
     seconds["update"] = time.perf_counter() - begin
     return Programs(

@@ -3,6 +3,8 @@
 import dataclasses
 import functools
 import os
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -122,3 +124,19 @@ def test_a_sum_without_a_fixed_order_is_found(monkeypatch):
     assert all("tests/test_manifest.py" in place for place in programs.unordered)
     reasons = manifest.inexact_because("jax", "fixed", programs.unordered)
     assert reasons[0].startswith("a sum without a fixed order: scatter")
+
+
+def test_a_run_on_c_imports_no_other_engine():
+    """MJX takes most of a second to import, Warp two; a run on engine `c` needs neither."""
+    lines = [
+        "import sys",
+        "from purerl import experiment, manifest, rundir",
+        "chosen = experiment.find('ant_run').experiment",
+        "setup = rundir.build(chosen)",
+        "manifest.collect(setup.engine, [chosen.build_env, chosen.build_network])",
+        "assert setup.engine == 'c'",
+        "print([name for name in sys.modules if name in ('mujoco.mjx', 'warp')])",
+    ]
+    words = [sys.executable, "-c", "\n".join(lines)]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
