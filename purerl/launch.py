@@ -63,8 +63,9 @@ def execute(
     alone(lambda: rundir.check_new_or_resume(runs, options.resume))
     loggers = needed_loggers(options)
     cache = set_up_jax(options.cache)
-    setup = rundir.build(chosen)
-    abstract = compilation.abstract_state(*setup[:3])
+    with compilation.no_collection():
+        setup = rundir.build(chosen)
+        abstract = compilation.abstract_state(*setup[:3])
     begun_with = alone(lambda: shards_on_disk(runs))
     shards = choose_shards(setup.config, abstract, options, begun_with)
     plan = train.make_plan(setup.config, chosen.evaluation, options.checkpoints, options.log_every)
@@ -114,10 +115,11 @@ def compile_programs(
     setup: rundir.Setup, evaluation: Evaluation, fresh: bool, vmapped: int, shards: Shards
 ) -> compilation.Programs:
     """Compiles what the run calls: on one device, or on those that share the shards."""
-    if shards.number > 1:
-        return spread.compile_programs(*setup[:3], evaluation, fresh, shards)
     calls_host = setup.engine == "c"
-    return compilation.compile_programs(*setup[:3], evaluation, fresh, vmapped, calls_host)
+    with compilation.no_collection():
+        if shards.number > 1:
+            return spread.compile_programs(*setup[:3], evaluation, fresh, shards)
+        return compilation.compile_programs(*setup[:3], evaluation, fresh, vmapped, calls_host)
 
 
 def shards_on_disk(folders: Iterable[Path]) -> int:
