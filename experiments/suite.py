@@ -20,8 +20,8 @@ experiment = Experiment(
         reset_pool=16,  # 8 of the 128 episodes of 1000 steps end in an update
         num_epochs=4,
         num_minibatches=8,
-        learning_rate=3e-4,
-        schedule="adaptive_kl",
+        learning_rate=1e-3,
+        schedule="linear",
         reward_scale=0.1,
     ),
     evaluation=Evaluation(num_episodes=32, number=6),

@@ -114,7 +114,7 @@ def compile_programs(
         init=beginning.result() if beginning else begin,
         update=functools.partial(update, *compiled) if calls_host else compiled[0],
         evaluate=evaluate,
-        seconds=dict(seconds),  # the evaluation's comes later
+        seconds=dict(seconds),  # the evaluation's may come later
         unordered=sorted({place for part in traced for place in unordered(part)}),
     )
 

@@ -230,7 +230,7 @@ def compile_programs(
             update, layout, collects, improve, ThreadPoolExecutor(len(collects))
         ),
         evaluate=lambda state: judge(on(device, state.learned)),
-        seconds=dict(seconds),  # the evaluation's comes later
+        seconds=dict(seconds),  # the evaluation's may come later
         unordered=sorted({*sums, *unordered(traced)}),
         spread=functools.partial(spread, layout),
         fetch=functools.partial(fetch, layout),
