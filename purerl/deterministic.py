@@ -7,8 +7,8 @@ is rewritten: each scatter-add with constant indices becomes gathers added in th
 updates, over the addresses that receive any. Nothing of MJX or JAX is patched, so nothing can leak
 into other code, and a new MJX that adds more scatter-adds is covered without being known here.
 
-A loop that counts up to a constant (MJX's Newton iterations) becomes a scan that stands still once
-it is done, with the same results: before each round of a `while` a GPU waits for the host, which
+A loop that counts up to a small constant (MJX's Newton iterations) becomes a scan that stands still
+once it is done, with the same results: before each round of a `while` a GPU waits for the host, which
 reads the condition, and programs for several devices wait for one another.
 """
 
@@ -33,6 +33,9 @@ from purerl.folding import (
 from purerl.ordered_sums import ordered_scatter, source
 from purerl.types import Array, PyTree
 
+# A scan makes all its rounds. Beyond so many the loop most likely ends far earlier: MuJoCo's default
+# is 100 iterations, of which a cartpole needs two.
+MOST_ROUNDS = 16
 _SUMS = ("scatter-add", "scatter_add", "scatter-mul", "scatter_mul", "scatter-sub", "scatter_sub")
 
 
@@ -203,7 +206,7 @@ def _scan_sizes(params: dict) -> tuple[int, int]:
 
 
 def _while(params: dict, inputs: list, known: list[Known], shared: dict) -> list:
-    """`lax.while_loop` with a rewritten condition and body; a scan if it counts to a constant."""
+    """`lax.while_loop` with a rewritten condition and body; a scan of few rounds at most."""
     n, m = params["cond_nconsts"], params["body_nconsts"]
     test, body = params["cond_jaxpr"], params["body_jaxpr"]
     carry = list(inputs[n + m :])
@@ -216,7 +219,7 @@ def _while(params: dict, inputs: list, known: list[Known], shared: dict) -> list
         return _evaluate(body, known[n : n + m] + unknown, shared, *inputs[n : n + m], *c)
 
     limit = rounds(params, known)
-    if limit is None:
+    if limit is None or limit > MOST_ROUNDS:
         return lax.while_loop(condition, step, carry)
 
     def step_unless_done(c, _):

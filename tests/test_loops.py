@@ -54,6 +54,7 @@ def test_the_count_may_begin_anywhere_that_is_known():
         lambda x: newton(x, step=2),  # a count of rounds that is not its number
         lambda x: newton(x, start=x.astype(jnp.int32)),  # from an unknown number on
         lambda x: newton(x, limit=x.astype(jnp.int32)),
+        lambda x: newton(x, limit=100),  # which it does not reach: a scan would
         lambda x: jax.lax.while_loop(lambda y: ~(y >= 5.0), lambda y: y * 2 + 1, x),
     ],
 )
