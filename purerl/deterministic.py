@@ -8,8 +8,8 @@ updates, over the addresses that receive any. Nothing of MJX or JAX is patched, 
 into other code, and a new MJX that adds more scatter-adds is covered without being known here.
 
 A loop that counts up to a small constant (MJX's Newton iterations) becomes a scan that stands still
-once it is done, with the same results: before each round of a `while` a GPU waits for the host, which
-reads the condition, and programs for several devices wait for one another.
+once it is done, with the same results: before each round of a `while` a GPU waits for the host,
+which reads the condition, and programs for several devices wait for one another.
 """
 
 import functools
@@ -33,8 +33,8 @@ from purerl.folding import (
 from purerl.ordered_sums import ordered_scatter, source
 from purerl.types import Array, PyTree
 
-# A scan makes all its rounds. Beyond so many the loop most likely ends far earlier: MuJoCo's default
-# is 100 iterations, of which a cartpole needs two.
+# A scan makes all its rounds. Beyond so many, the loop most likely ends far earlier: MuJoCo's
+# default is 100 iterations, of which a cartpole needs two.
 MOST_ROUNDS = 16
 _SUMS = ("scatter-add", "scatter_add", "scatter-mul", "scatter_mul", "scatter-sub", "scatter_sub")
 
