@@ -2,7 +2,7 @@
 
 python -m purerl.run cartpole_swingup
 
-Expected: return 938 of 1000 after 21 s, on two CPU cores.
+Expected: return 940 of 1000 after 15 s, on two CPU cores.
 """
 
 from envs import cartpole_swingup
