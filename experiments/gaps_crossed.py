@@ -32,6 +32,11 @@ def gaps_of(setup: rundir.Setup, state: TrainState, seed: int, episodes: int) ->
     return jax.device_get(jax.jit(judge)(state, key))
 
 
+def count_features(state: TrainState) -> int:
+    """O: how many features a policy observes."""
+    return state.normalizer.mean.value.shape[-1]
+
+
 def blind(network: Network, size: int) -> Network:
     """Lets a network of `size` observation features act on observations with more at the end."""
     return Network(
@@ -77,14 +82,15 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--floor-run", type=Path, help="a run of the same body on a floor")
     parser.add_argument("--episodes", type=int, default=128, help="corridors")
     parser.add_argument("--seed", type=int, default=12345, help="draws the corridors")
+    parser.add_argument("--engine", default="", help="where it should not be the run's own")
     options = parser.parse_args(arguments)
-    trained = rundir.restore(options.run, "latest", print)
+    trained = rundir.restore(options.run, "latest", print, options.engine)
     setup, state = trained.setup, trained.saved.state
     policies = {"trained": (setup, state)}
     if options.floor_run:
-        floor = rundir.restore(options.floor_run, "latest", print)
-        size = floor.saved.state.env.observation.shape[-1]
-        extra = state.env.observation.shape[-1] - size
+        floor = rundir.restore(options.floor_run, "latest", print, options.engine)
+        size = count_features(floor.saved.state)
+        extra = count_features(state) - size
         network = blind(floor.setup.network, size)
         policies["floor"] = setup._replace(network=network), widen(floor.saved.state, extra)
     policies["still"] = setup._replace(network=still(setup.env.action_size)), state

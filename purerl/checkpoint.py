@@ -74,6 +74,10 @@ def save(folder: Path, leaves: Leaves, meta: dict[str, Any]) -> Path:
 def load(path: Path, abstract: PyTree) -> Saved:
     """Reads one checkpoint and checks every hash.
 
+    Args:
+      path: of one update.
+      abstract: shapes of the state. A field of it that is None is left out, whatever was saved.
+
     Raises:
       DamagedError: a file or a leaf is not what was written.
       UserError: it is whole, but of another state than `abstract` (other sizes or networks).
@@ -216,6 +220,7 @@ def _check_fits(path: Path, meta: dict[str, Any], abstract: PyTree) -> None:
     shapes = [[str(x.dtype), list(x.shape)] for x in jax.tree.leaves(raw)]
     wanted = dict(zip(leaf_paths(abstract), shapes, strict=True))
     stored = {key: [about["dtype"], about["shape"]] for key, about in meta["leaves"].items()}
+    stored = {key: shape for key, shape in stored.items() if not _is_left_out(key, abstract)}
     for key in sorted({*wanted, *stored}):
         if wanted.get(key) != stored.get(key):
             raise UserError(
@@ -223,6 +228,10 @@ def _check_fits(path: Path, meta: dict[str, Any], abstract: PyTree) -> None:
                 f"{stored.get(key, 'absent')} in it and {wanted.get(key, 'absent')} in this "
                 "experiment. Use the settings that the run was started with."
             )
+
+
+def _is_left_out(key: str, abstract: PyTree) -> bool:
+    return getattr(abstract, key.partition("/")[0], key) is None
 
 
 def _metas(folder: Path) -> Iterator[dict[str, Any]]:

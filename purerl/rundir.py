@@ -15,7 +15,7 @@ from purerl.env import Env
 from purerl.errors import UserError, one_line
 from purerl.experiment import Experiment, Source
 from purerl.loggers import Say
-from purerl.types import Network
+from purerl.types import Network, TrainState
 
 LOCK = ".lock"
 OURS = {LOCK, "config.json", "manifest.json", "experiment.py", "metrics.jsonl", "checkpoints"}
@@ -152,7 +152,8 @@ def restore(folder: Path, update: str, say: Say, engine: str = "") -> Run:
       folder: the run.
       update: "latest", "best" (highest evaluation return), or an update's number.
       say: told of damaged checkpoints.
-      engine: instead of the run's own, where that one is not at hand.
+      engine: instead of the run's own, where that one is not at hand; the state then comes without
+        `env` and `episode`, which are that engine's.
     """
     if not (folder / "config.json").is_file():
         raise UserError(f"{folder} is no run: it has no config.json.")
@@ -163,11 +164,13 @@ def restore(folder: Path, update: str, say: Say, engine: str = "") -> Run:
     if engine:
         chosen = experiment.from_json(chosen, experiment.to_json(chosen) | {"engine": engine})
     setup = build(chosen)
-    return Run(chosen, setup, _choose(folder / "checkpoints", update, setup, say), settings)
-
-
-def _choose(folder: Path, update: str, setup: Setup, say: Say) -> checkpoint.Saved:
     abstract = compilation.abstract_state(*setup[:3])
+    if engine:
+        abstract = abstract.replace(env=None, episode=None)
+    return Run(chosen, setup, _choose(folder / "checkpoints", update, abstract, say), settings)
+
+
+def _choose(folder: Path, update: str, abstract: TrainState, say: Say) -> checkpoint.Saved:
     found = checkpoint.updates(folder)
     if update == "latest":
         saved = checkpoint.newest(folder, abstract, say, set_aside=False)

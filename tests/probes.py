@@ -4,6 +4,7 @@ After Andy Jones, "Debugging RL, without the agonizing pain" (2021). All are sol
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -57,6 +58,26 @@ class Probe:
         if self.name == "discounting":
             shown = time.astype(jnp.float32)
         return _state(shown[None], reward, last, state.task | {"time": time})
+
+
+@dataclass(frozen=True)
+class EngineProbe(Probe):
+    """A probe that counts its steps under its engine's name."""
+
+    engine: str = ""
+
+    def step(self, state: State, action: Array) -> State:
+        return self._count(super().step(state, action), 1.0)
+
+    def reset(self, key: Array) -> State:
+        return self._count(super().reset(key), 0.0)
+
+    def _count(self, state: State, number: float) -> State:
+        return state.replace(metrics=state.metrics | {f"{self.engine}_count": jnp.float32(number)})
+
+
+def engine_probe(engine: str, *arguments: Any) -> EngineProbe:
+    return EngineProbe(*arguments, engine=engine)
 
 
 REWARDS = {

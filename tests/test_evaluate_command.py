@@ -57,6 +57,20 @@ def test_a_checkpoint_can_be_chosen(trained, tmp_path, capsys):
     assert f"Valid: latest, best, {updates[0]}" in capsys.readouterr().err
 
 
+def test_a_policy_is_judged_on_an_engine_whose_states_have_other_leaves(tmp_path):
+    # As a run of engine warp, which counts overflows, is on a laptop.
+    text = TOY.read_text().replace("return Probe(", "return engine_probe(engine, ")
+    text = text.replace("import Probe", "import Probe, engine_probe")
+    file = tmp_path / "engines.py"
+    file.write_text(text)
+    assert run.main([str(file), "--runs", str(tmp_path), "--engine", "c"]) == 0
+    trained = tmp_path / "engines" / "seed1"
+    assert "c_count" in result(trained, tmp_path)["metrics"]
+    elsewhere = result(trained, tmp_path, "--engine", "jax")
+    assert "jax_count" in elsewhere["metrics"] and "c_count" not in elsewhere["metrics"]
+    assert elsewhere["digest"] == result(trained, tmp_path)["digest"]
+
+
 @pytest.mark.parametrize("words", [["/nowhere"], ["/nowhere", "--episods", "3"], []])
 def test_a_mistake_is_one_line(words, capsys):
     assert evaluate.main(words) == USAGE
