@@ -81,6 +81,9 @@ class Options:
     """Reward for each control step that ends healthy."""
     control_weight: float = 0.1
     """Reward taken for the sum of squared actions."""
+    least_height: float | None = None
+    """Of the torso above the ground, below which the episode ends [m]; none: the body's own, below
+    which it lies. Lower, a foot that slips into a gap is no end: the body can climb out."""
     healthy_up: float = 0.0
     """Least z of the torso's up-axis: below, the body lies on its back, which ends the episode."""
     reset_noise: float = 0.01
@@ -174,8 +177,9 @@ class Run:
             # Beyond the end there is no ground; having run all of the corridor is no failure.
             finished = healthy & (physics.qpos[0] >= self.parts.arena.length)
             crossed = jnp.maximum(gaps_crossed(task["course"], physics.qpos[0]), task["crossed"])
-            # A body below its healthy height has fallen in, however far it flew.
-            crossed = jnp.where(healthy, crossed, task["crossed"])
+            # A body below its own healthy height has fallen in, however far it flew.
+            stands = healthy & (height > self.parts.body.healthy_height[0])
+            crossed = jnp.where(stands, crossed, task["crossed"])
             metrics["gaps_crossed_count"] = (crossed - task["crossed"]).astype(jnp.float32)
             task |= {"crossed": crossed}
         return State(
@@ -223,6 +227,8 @@ def is_healthy(body: Body, options: Options, height: Array, up: Array, turn: Arr
     ahead, seen from above [rad].
     """
     low, high = body.healthy_height
+    if options.least_height is not None:
+        low = options.least_height
     upright = (height > low) & (height < high) & (up > options.healthy_up)
     return upright & (turn < body.healthy_turn)
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
 from purerl import normalizer
 from purerl.config import Config, check_divides
@@ -66,7 +67,7 @@ def init(config: Config, env: Env, network: Network, key: Array) -> TrainState:
     limit = jax.vmap(lambda k: jax.random.randint(k, (), 1, config.episode_length + 1))(limit_keys)
     return TrainState(
         params=params,
-        optimizer=optimizer(config).init(params),
+        optimizer=optimizer(config).init(ravel_pytree(params)[0]),
         learning_rate=jnp.asarray(config.learning_rate, jnp.float32),
         normalizer=normalizer.init(jax.tree.map(lambda x: x[0], env_state.observation)),
         reward_normalizer=normalizer.init(jnp.zeros(())),

@@ -201,6 +201,22 @@ def test_a_crossed_gap_is_counted_once_and_a_fall_is_not_a_crossing():
     assert move(back, beyond, 0.52).metrics["gaps_crossed_count"] == 0
 
 
+def test_a_body_that_may_climb_out_of_a_gap_has_crossed_it_when_it_stands():
+    env = run.build(run.Options(arena="gaps", least_height=-0.1), "c")
+    state = env.reset(jax.random.key(0))
+    beyond = state.task["course"][1, 0] + 0.1
+
+    def at(z):
+        physics = state.physics.replace(qpos=state.physics.qpos.at[0].set(beyond).at[2].set(z))
+        _, readings = env.physics.init(physics.qpos, physics.qvel)
+        return env._state(physics, readings, state.task, beyond, jnp.zeros(8))
+
+    hanging, standing, fallen = at(0.1), at(0.52), at(-0.2)
+    assert not hanging.terminated and hanging.metrics["gaps_crossed_count"] == 0
+    assert not standing.terminated and standing.metrics["gaps_crossed_count"] == 1
+    assert fallen.terminated and fallen.metrics["gaps_crossed_count"] == 0
+
+
 @pytest.mark.parametrize("words", [{"friction": (0.0, 1.0)}, {"gear": (2.0, 1.0)}])
 def test_impossible_factors_are_refused(words):
     with pytest.raises(ValueError, match="give factors"):

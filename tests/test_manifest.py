@@ -70,7 +70,8 @@ def test_a_manifest_says_whether_the_run_is_exact_and_what_prevents_it(monkeypat
     assert warp["bit_exact"] is False and "warp" in warp["inexact_because"][0]
 
 
-FIXED = "--xla_gpu_autotune_level=0 --xla_gpu_enable_triton_gemm=false"
+REDUCTIONS = "--xla_gpu_experimental_enable_fusion_block_level_rewriter=true"
+FIXED = f"--xla_gpu_autotune_level=0 --xla_gpu_enable_triton_gemm=false {REDUCTIONS}"
 
 
 @pytest.mark.parametrize(
@@ -80,7 +81,7 @@ FIXED = "--xla_gpu_autotune_level=0 --xla_gpu_enable_triton_gemm=false"
         ("--xla_a=b", f"--xla_a=b {FIXED}", "fixed"),
         (
             "--xla_gpu_enable_triton_gemm=true",
-            "--xla_gpu_enable_triton_gemm=true --xla_gpu_autotune_level=0",
+            f"--xla_gpu_enable_triton_gemm=true --xla_gpu_autotune_level=0 {REDUCTIONS}",
             "fixed",
         ),
         ("--xla_gpu_autotune_level=4", "--xla_gpu_autotune_level=4", "by timing"),
