@@ -60,9 +60,9 @@ class GapsCorridor:
 
     @property
     def platforms(self) -> int:
-        """P: enough platforms to reach the end of the corridor in every draw."""
+        """P: enough to reach the end of the corridor in every draw, and two to be seen beyond."""
         shortest = self.platform_length[0] + self.gap_length[0]
-        return 1 + math.ceil((self.length - self.start_length) / shortest)
+        return 3 + math.ceil((self.length - self.start_length) / shortest)
 
     @property
     def longest_platform(self) -> float:

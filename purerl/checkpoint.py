@@ -7,6 +7,7 @@ disk. So here: hashes beside the arrays, deletion by rename, and the truth read 
 Zero-size arrays, which Orbax refuses, count in the digest but are not written.
 """
 
+import contextlib
 import hashlib
 import json
 import logging
@@ -21,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from purerl.errors import UserError
+from purerl.errors import UserError, one_line
 from purerl.snapshot import Leaves, digest_leaves, leaf_paths, unflatten
 from purerl.types import PyTree, is_key
 
@@ -91,6 +92,8 @@ def load(path: Path, abstract: PyTree) -> Saved:
         with _checkpointer() as checkpointer:
             arguments = ocp.args.Composite(state=ocp.args.StandardRestore(target))
             leaves |= checkpointer.restore(path.absolute(), arguments).state
+    except (PermissionError, MemoryError) as error:  # no damage: it shall not be put aside
+        raise UserError(f"The checkpoint {path} cannot be read: {one_line(error)}") from error
     except Exception as error:  # Orbax raises many kinds for broken files, none of them its own
         raise DamagedError(f"its arrays cannot be read ({type(error).__name__})") from error
     for key, about in meta["leaves"].items():
@@ -122,6 +125,31 @@ def updates(folder: Path) -> list[int]:
     return sorted(int(d.name) for d in folder.iterdir() if d.name.isdigit() and d.is_dir())
 
 
+def check_fits(folder: Path, abstract: PyTree) -> None:
+    """Raises UserError if the newest checkpoint is of another state; reads no array."""
+    for update in reversed(updates(folder)):
+        path = folder / f"{update:012d}"
+        with contextlib.suppress(DamagedError):
+            _check_fits(path, load_meta(path), abstract)
+            return
+
+
+def check_none_lost(folders: Sequence[Path]) -> None:
+    """Raises UserError where there were checkpoints: a run does not silently begin again.
+
+    A kill in the first save leaves none, or of seeds that train together some with one.
+    """
+    for folder in folders:
+        damaged = sorted(path.name for path in folder.glob("damaged-*"))
+        if damaged or len(updates(folder)) > 1:
+            kept = ", ".join([*damaged, *map(str, updates(folder))])
+            shared = " that all seeds have" if len(folders) > 1 else ""
+            raise UserError(
+                f"{folder} holds no whole checkpoint{shared}, but {kept}: there is nothing to go "
+                "on from. Train anew under another --name."
+            )
+
+
 def newest(
     folder: Path, abstract: PyTree, say: Callable[[str], None], set_aside: bool = True
 ) -> Saved | None:
@@ -148,7 +176,7 @@ def newest_of_all(
             except DamagedError as error:
                 kept = _set_aside(path) if set_aside else path
                 say(f"Checkpoint of update {update} is damaged: {error}. It is kept as {kept}; "
-                    "using the one before it.")  # fmt: skip
+                    "the one before it is taken, if there is one.")  # fmt: skip
         if len(found) == len(folders):
             return found
     return []
@@ -226,7 +254,7 @@ def _check_fits(path: Path, meta: dict[str, Any], abstract: PyTree) -> None:
             raise UserError(
                 f"The checkpoint {path} is of another state: leaf {key} is "
                 f"{stored.get(key, 'absent')} in it and {wanted.get(key, 'absent')} in this "
-                "experiment. Use the settings that the run was started with."
+                "experiment. Use the settings and the version of purerl that the run began with."
             )
 
 

@@ -104,7 +104,8 @@ def compile_programs(
         traced.append(jax.jit(part, donate_argnums=0).trace(*given))
         started.append(start(name, traced[-1], seconds))
         given = shapes(traced[-1].out_info)
-    begin: Any = jax.jit(init)
+    # Wherever it is compiled: at another level of LLVM its bits are others.
+    begin: Any = jax.jit(init, compiler_options=compiler_options("init"))
     evaluate: Any = jax.jit(judge)
     beginning = start("init", begin.trace(key), seconds) if fresh else None
     if evaluation.number:

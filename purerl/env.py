@@ -9,9 +9,16 @@ from flax import struct
 
 from purerl.types import Array, PyTree, is_key
 
+# A state with a component beyond this is as lost as one with NaN: MuJoCo gives up at 1e10, and
+# a body at 1e6 m or 1e6 rad/s would poison the observation statistics long before that.
+ABSURD = 1e6
+
 
 class State(struct.PyTreeNode):
     """One environment between two control steps.
+
+    A number beyond `ABSURD` in either direction, or NaN, ends the episode as lost: it teaches
+    nothing, and counts as `nonfinite_resets`.
 
     A metric is averaged over an episode's steps, unless its name ends in `_count`: then it is
     summed (gaps crossed, falls, contacts).
@@ -198,10 +205,12 @@ def _host_leaves(state: PyTree) -> dict[str, np.ndarray]:
 
 def _check_finite(when: str, state: PyTree) -> None:
     for name, value in _host_leaves(state).items():
-        if np.issubdtype(value.dtype, np.floating) and not np.isfinite(value).all():
+        # A NaN fails the comparison.
+        if np.issubdtype(value.dtype, np.floating) and not (np.abs(value) <= ABSURD).all():
+            what = f"{np.abs(value).max():.3g}" if np.isfinite(value).all() else "not finite"
             raise EnvError(
-                f"{name} is not finite after {when}: every number must be finite for "
-                "any actions in [-1, 1]."
+                f"{name} is {what} after {when}: every number must be finite, and at most "
+                f"{ABSURD:.0e}, for any actions in [-1, 1], or the episode counts as lost."
             )
 
 

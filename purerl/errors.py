@@ -49,7 +49,8 @@ def one_line(error: BaseException) -> str:
 def leave(command: Callable[[], int]) -> NoReturn:
     """Ends the process with a command's exit code; in silence when its reader has left (`| head`).
 
-    The code is then the one of a program that SIGPIPE ended.
+    The code is then the one of a program that SIGPIPE ended; in silence too, with that of SIGINT,
+    after Ctrl-C where nothing has begun.
     """
     try:
         code = command()
@@ -57,4 +58,6 @@ def leave(command: Callable[[], int]) -> NoReturn:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more
         code = 128 + signal.SIGPIPE
+    except KeyboardInterrupt:
+        code = 128 + signal.SIGINT
     sys.exit(code)

@@ -55,7 +55,9 @@ def evaluate(
     progress = Progress(
         t=jnp.zeros((), jnp.int32),
         env=start,
-        memory=jax.tree.map(lambda x: jnp.zeros((num_episodes, *x.shape[1:])), state.carry),
+        memory=jax.tree.map(
+            lambda x: jnp.zeros((num_episodes, *x.shape[1:]), x.dtype), state.carry
+        ),
         episode=start_episodes(start, limit),
         over=never,
         lost=never,

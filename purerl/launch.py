@@ -83,12 +83,13 @@ def execute(
         rundir.check_new_or_resume(runs, options.resume)  # again: another may have been here
         for folder, one in runs.items():
             settings = rundir.describe(source, one, schedule)
-            begin_or_go_on(folder, source, settings, facts, options.allow_changes)
+            begin_or_go_on(folder, source, settings, facts, abstract, options.allow_changes)
         lines = console.describe_plan(plan, setup, abstract, facts, list(runs), cache)
         print("\n".join(lines), flush=True)
-        return not all(any((folder / "checkpoints").glob("*")) for folder in runs)
+        return not all(checkpoint.updates(folder / "checkpoints") for folder in runs)
 
-    fresh = alone(prepare)
+    with rundir.refusals():
+        fresh = alone(prepare)
 
     @functools.cache
     def programs() -> compilation.Programs:
@@ -97,6 +98,8 @@ def execute(
             reasons = manifest.inexact_because(setup.engine, chosen_by, made.unordered)
             for folder in runs:
                 rundir.amend(folder, manifest.exactness(reasons))
+            for place in made.unordered:
+                print(f"Not bit-exact: nothing fixes the order of the sum {place}", flush=True)
         return made
 
     groups = [list(runs)] if vmapped > 1 else [[folder] for folder in runs]
@@ -184,6 +187,8 @@ def train_together(
 
         def find() -> dict[str, Any]:
             saved.extend(checkpoint.newest_of_all(places, abstract, progress.say))
+            if not saved:
+                checkpoint.check_none_lost(places)
             known = saved[0].meta if saved else {"wall_s": 0.0, "update": 0}
             return {name: known[name] for name in ("wall_s", "update")} | {"found": bool(saved)}
 
@@ -198,7 +203,8 @@ def train_together(
         state = first_state(meta.pop("found"), saved, seeds, programs(), abstract, progress.say)
         recorders: list[Any] = [distributed.Silent(folder) for folder in folders]
         if distributed.is_first():
-            recorders = open_recorders(folders, saved, options, progress.say)
+            with rundir.refusals():
+                recorders = open_recorders(folders, saved, options, progress.say)
             for folder, recorder in zip(folders, recorders, strict=True):
                 stack.callback(recorder.close)
                 recorder.loggers = [
@@ -263,6 +269,7 @@ def begin_or_go_on(
     source: Source,
     settings: dict[str, Any],
     facts: dict[str, Any],
+    abstract: PyTree,
     allow_changes: bool,
 ) -> None:
     """Describes a new run on disk, or checks that this process would continue the old one."""
@@ -280,6 +287,7 @@ def begin_or_go_on(
             + "\nGive the command it was begun with, or --allow-changes to go on all the same."
         )
     if found:
+        checkpoint.check_fits(folder / "checkpoints", abstract)
         rundir.accept_changes(folder, source, settings, facts, found)
 
 

@@ -136,7 +136,10 @@ def unroll(network: Network, params: PyTree, batch: Batch, memory: PyTree) -> Po
     def step(memory: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, PolicyOutput]:
         observation, first = row
         fresh = jax.tree.map(
-            lambda x: jnp.where(jnp.expand_dims(first, tuple(range(1, x.ndim))), 0.0, x), memory
+            lambda x: jnp.where(
+                jnp.expand_dims(first, tuple(range(1, x.ndim))), jnp.zeros_like(x), x
+            ),
+            memory,
         )
         output, memory = network.apply(params, observation, fresh)
         return memory, output
@@ -209,7 +212,7 @@ def minibatch_step(
     norm = optax.tree.norm(gradients)
     sound = jnp.isfinite(objective) & jnp.isfinite(norm)
     updates, optimizer_state = optimizer(config).update(gradients, learner.optimizer)
-    stepped = learner.params - learner.learning_rate * updates
+    stepped = learner.params - (learner.learning_rate * updates).astype(learner.params.dtype)
     params, optimizer_state = jax.tree.map(
         lambda new, old: jnp.where(sound, new, old),
         (stepped, optimizer_state),

@@ -60,6 +60,7 @@ def init(config: Config, env: Env, network: Network, key: Array) -> TrainState:
     not stay in phase: B environments all at the same moment of an episode are one sample.
     """
     params, carry = network.init(derive(key, Purpose.PARAMETERS))
+    check_parameters(params)
     check_sizes(config, carry)
     size = config.num_envs
     env_state = jax.vmap(env.reset)(per_environment(derive(key, Purpose.FIRST_RESET), size))
@@ -80,6 +81,17 @@ def init(config: Config, env: Env, network: Network, key: Array) -> TrainState:
         steps=zero_count(),
         skipped_in_a_row=jnp.zeros((), jnp.int32),
     )
+
+
+def check_parameters(params: PyTree) -> None:
+    """Raises ValueError for a parameter that no gradient can change."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            raise ValueError(
+                f"The network's parameter {jax.tree_util.keystr(path)} is {leaf.dtype}: parameters "
+                "are trained, so they are floating-point numbers. Keep constants in the closure of "
+                "`apply`."
+            )
 
 
 def update(

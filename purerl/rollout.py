@@ -12,14 +12,10 @@ from flax import struct
 from purerl import normalizer
 from purerl.config import Config
 from purerl.distributions import sample
-from purerl.env import Env, State
+from purerl.env import ABSURD, Env, State
 from purerl.keys import Purpose, derive, per_environment
 from purerl.starts import draw_pool, take_from_pool
 from purerl.types import Array, EpisodeStats, Network, PolicyOutput, PyTree, TrainState
-
-# A state with a component beyond this is as lost as one with NaN: MuJoCo gives up at 1e10, and
-# a body at 1e6 m or 1e6 rad/s would poison the observation statistics long before that.
-ABSURD = 1e6
 
 
 class Transition(NamedTuple):

@@ -1,11 +1,13 @@
 """A run's folder: who may write to it, what it says about the run, and how to rebuild it."""
 
+import contextlib
 import fcntl
+import inspect
 import json
 import os
 import shutil
 import uuid
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -82,6 +84,16 @@ def lock(folder: Path) -> IO[str]:
     return handle
 
 
+@contextlib.contextmanager
+def refusals() -> Iterator[None]:
+    """Makes one line of a disk that refuses what a run needs before it can begin."""
+    try:
+        yield
+    except OSError as error:
+        where = error.filename or "The folder of the run"
+        raise UserError(f"{where} cannot be written: {error.strerror or error}.") from error
+
+
 def check_new_or_resume(folders: Iterable[Path], resume: bool) -> None:
     """Raises UserError when a folder holds a run and should not, or none of them does and should.
 
@@ -146,28 +158,48 @@ def amend(folder: Path, facts: dict[str, Any]) -> None:
 
 
 def restore(folder: Path, update: str, say: Say, engine: str = "") -> Run:
-    """Rebuilds a run from its folder alone; changes nothing in it.
+    """Rebuilds a run from its folder alone, to see what its policy does; changes nothing in it.
+
+    The state comes without `env`, `episode` and `optimizer`: a policy needs none of them, and on
+    another engine or with another version of this package they may be laid out otherwise.
 
     Args:
       folder: the run.
       update: "latest", "best" (highest evaluation return), or an update's number.
-      say: told of damaged checkpoints.
-      engine: instead of the run's own, where that one is not at hand; the state then comes without
-        `env` and `episode`, which are that engine's.
+      say: told of damaged checkpoints, and of what is no longer as it was when the run began.
+      engine: instead of the run's own, where that one is not at hand.
     """
     if not (folder / "config.json").is_file():
         raise UserError(f"{folder} is no run: it has no config.json.")
     settings = read_json(folder / "config.json")
     source = experiment.load(folder / "experiment.py", settings["experiment"])
-    template = experiment.to_json(source.experiment)
-    chosen = experiment.from_json(source.experiment, template | settings["settings"])
+    filled = fill(settings["settings"], experiment.to_json(source.experiment), say)
+    chosen = experiment.from_json(source.experiment, filled)
+    if code_changed(folder, source):
+        say("The code of the environment or the trainer is not that of the run any more.")
     if engine:
         chosen = experiment.from_json(chosen, experiment.to_json(chosen) | {"engine": engine})
     setup = build(chosen)
     abstract = compilation.abstract_state(*setup[:3])
-    if engine:
-        abstract = abstract.replace(env=None, episode=None)
+    abstract = abstract.replace(env=None, episode=None, optimizer=None)
     return Run(chosen, setup, _choose(folder / "checkpoints", update, abstract, say), settings)
+
+
+def code_changed(folder: Path, source: Source) -> bool:
+    """Tells whether the code that the run's own file calls has been edited since the run began."""
+    builders = (source.experiment.build_env, source.experiment.build_network)
+    if any(Path(inspect.getfile(builder)) == source.path for builder in builders):
+        return False  # it is its own copy of that code
+    return manifest.source_hash(builders) != read_json(folder / "manifest.json").get("source")
+
+
+def fill(old: Any, new: Any, say: Say, path: str = "") -> Any:
+    """Returns the settings `old` of a run with those of `new` that have come to the code since."""
+    if not (isinstance(old, dict) and isinstance(new, dict)):
+        return old
+    for name in new.keys() - old.keys():
+        say(f"config.json lacks {path}{name}; it is taken as {new[name]}.")
+    return new | {name: fill(old[name], new.get(name), say, f"{path}{name}.") for name in old}
 
 
 def _choose(folder: Path, update: str, abstract: TrainState, say: Say) -> checkpoint.Saved:

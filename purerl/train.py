@@ -145,7 +145,8 @@ def train(
     for recorder in recorders:
         recorder.finish()
     if update < plan.updates:
-        raise StoppedError(f"Stopped after update {update} of {plan.updates}; it is saved.")
+        state_of = "it is saved" if update else "there is nothing to save yet"
+        raise StoppedError(f"Stopped after update {update} of {plan.updates}; {state_of}.")
 
 
 def each_seed(tree: PyTree, number: int) -> list[PyTree]:

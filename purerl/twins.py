@@ -15,7 +15,7 @@ class Comparison(NamedTuple):
     first: str
     second: str
     same: bool | None  # None: no checkpoint of the same update to compare
-    promised: bool  # whether manifest and source agree, so that any difference is a fault
+    promised: bool  # both bit-exact, manifest and source agree: any difference is a fault
     lines: list[str]  # what was found, for a person
     last_equal: int | None  # the last update whose digests agree, before they part
     parted: int | None  # the first update whose digests, or else metrics, do not
@@ -64,7 +64,7 @@ def compare(a: History, b: History) -> Comparison:
         first=str(a.path),
         second=str(b.path),
         same=not parted if common else None,
-        promised=not conditions,
+        promised=not conditions and all(run.manifest.get("bit_exact", True) for run in (a, b)),
         lines=lines,
         last_equal=equal[-1] if equal else None,
         parted=parted[0] if parted else None,

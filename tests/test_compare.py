@@ -193,6 +193,13 @@ def test_under_other_conditions_a_difference_is_no_fault(tmp_path, capsys):
     assert "other conditions: engine: c -> jax" in capsys.readouterr().out
 
 
+def test_runs_that_promise_no_bits_may_differ(tmp_path):
+    for name, digest in (("a", "d1"), ("b", "e1")):
+        make_run(tmp_path / "runs" / name, 1, [1.0] * 4, digests=[digest], bit_exact=False)
+    (pair,) = found(tmp_path, tmp_path / "runs", code=0)["pairs"]
+    assert pair["same"] is False and not pair["promised"]
+
+
 def test_real_runs_part_at_a_named_leaf(tmp_path, capsys):
     runs = tmp_path / "runs"
     for name, seed in (("one", "1"), ("two", "2")):

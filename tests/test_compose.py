@@ -31,7 +31,7 @@ def case(request):
 
 def short(arena: GapsCorridor) -> GapsCorridor:
     """A short corridor from x = 0: `ALL_BOXES` boxes hold the whole course."""
-    length = 1.5 + (ALL_BOXES - 1) * (arena.platform_length[0] + arena.gap_length[0]) - 1e-6
+    length = 1.5 + (ALL_BOXES - 3) * (arena.platform_length[0] + arena.gap_length[0]) - 1e-6
     return dataclasses.replace(arena, length=length, start_length=1.5, spawn_x=1.0)
 
 

@@ -157,6 +157,11 @@ class HiddenMemoryInStep(Toy):
         return toy_state(state.physics + 0.1 * action + host_counter())
 
 
+class HugeReward(Toy):
+    def step(self, state, action):
+        return super().step(state, action).replace(reward=jnp.float32(2e6))
+
+
 class TracedBranch(Toy):
     def step(self, state, action):
         if action[0] > 0:
@@ -184,6 +189,7 @@ BROKEN = {
     OtherShape: r"observation\['policy'\] is float32 \[2\] from reset and float32 \[3\] from step",
     NaNAtFullAction: "reward is not finite after step",
     NaNAfterEnd: "reward is not finite after a step after termination",
+    HugeReward: r"reward is 2e\+06 after step.*at most 1e\+06",
     OneStart: "same for different keys",
     HiddenMemory: "differs between two calls with equal keys",
     HiddenMemoryInStep: "differs between two calls with equal states and actions",

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from envs import cartpole_swingup, run
+from envs import arenas, cartpole_swingup, run
 from envs.bodies import ANT
 from purerl.env import check_env
 from purerl.physics import PhysicsState
@@ -215,6 +215,21 @@ def test_a_body_that_may_climb_out_of_a_gap_has_crossed_it_when_it_stands():
     assert not hanging.terminated and hanging.metrics["gaps_crossed_count"] == 0
     assert not standing.terminated and standing.metrics["gaps_crossed_count"] == 1
     assert fallen.terminated and fallen.metrics["gaps_crossed_count"] == 0
+
+
+@pytest.mark.parametrize(
+    "lengths", [{"platform_length": (1.5, 1.5), "gap_length": (0.2, 0.2)}, {"runway": 34.0}]
+)
+def test_at_the_end_of_a_corridor_the_platform_underfoot_is_still_the_first(lengths):
+    env = run.build(run.Options(arena="gaps", **lengths), "c")
+    state = env.reset(jax.random.key(0))
+    course = state.task["course"]
+    start, end = arenas.distances_to_next_edges(course, jnp.float32(39.9), 6, 4.0)[:2]
+    course = np.asarray(course)
+    under = course[(course[:, 1] >= 39.9).argmax()]
+    np.testing.assert_allclose([start, end], np.clip(under - 39.9, -4.0, 4.0), atol=1e-5)
+    qpos = state.physics.qpos.at[0].set(39.9)
+    env.step(state.replace(physics=state.physics.replace(qpos=qpos)), jnp.zeros(8))
 
 
 @pytest.mark.parametrize("words", [{"friction": (0.0, 1.0)}, {"gear": (2.0, 1.0)}])

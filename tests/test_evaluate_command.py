@@ -88,6 +88,24 @@ def test_settings_that_do_not_fit_the_file_are_named(trained, tmp_path, capsys):
     assert "env.gravity" in capsys.readouterr().err
 
 
+def test_a_setting_and_code_that_came_after_the_run_are_told(tmp_path, capsys):
+    file = tmp_path / "later.py"  # with its builders elsewhere
+    file.write_text("from tests.toy_experiment import experiment")
+    assert run.main([str(file), "--runs", str(tmp_path)]) == 0
+    trained = tmp_path / "later" / "seed1"
+    result(trained, tmp_path)
+    assert "any more" not in capsys.readouterr().out
+    settings, facts = trained / "config.json", trained / "manifest.json"
+    older = json.loads(settings.read_text())
+    del older["settings"]["ppo"]["reset_pool"]
+    settings.write_text(json.dumps(older))
+    facts.write_text(json.dumps(json.loads(facts.read_text()) | {"source": "older"}))
+    assert result(trained, tmp_path)["update"] == 12
+    said = capsys.readouterr().out
+    assert "config.json lacks ppo.reset_pool; it is taken as 0." in said
+    assert "is not that of the run any more" in said
+
+
 def test_it_leaves_in_silence_when_its_reader_has(trained):
     command = [sys.executable, "-m", "purerl.evaluate", str(trained), "--episodes", "2"]
     ended = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)

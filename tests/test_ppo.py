@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from purerl import learner, networks, normalizer, ppo, targets
+from purerl import evaluation, learner, networks, normalizer, ppo, targets
 from purerl.env import State
 from purerl.rollout import rollout
 from purerl.types import count_as_int
@@ -299,6 +299,48 @@ def test_a_gradient_in_slices_is_the_same_sum(monkeypatch, recurrent):
     for a, b in zip(jax.tree.leaves(whole.params), jax.tree.leaves(sliced.params), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4)
     assert float(others["value_loss"]) == pytest.approx(float(metrics["value_loss"]), rel=1e-3)
+
+
+def altered(network, change):
+    """The network with other parameters or another memory, which its `apply` undoes."""
+
+    def init(key):
+        params, carry = network.init(key)
+        return change(params, carry)
+
+    return network._replace(init=init)
+
+
+def test_parameters_that_no_gradient_changes_are_refused():
+    whole = altered(
+        NETWORKS[False], lambda params, carry: (params | {"table": jnp.arange(3)}, carry)
+    )
+    with pytest.raises(ValueError, match=r"\['table'\] is int32: parameters are trained"):
+        jax.eval_shape(partial(ppo.init, CONFIG, Walk(), whole), jax.random.key(0))
+
+
+def test_parameters_of_half_precision_stay_so():
+    half = altered(
+        NETWORKS[False],
+        lambda params, carry: (jax.tree.map(lambda x: x.astype(jnp.bfloat16), params), carry),
+    )
+    state, metrics = UPDATE(CONFIG, Walk(), half, INIT(CONFIG, Walk(), half, jax.random.key(0)))
+    assert {x.dtype.name for x in jax.tree.leaves(state.params)} == {"bfloat16"}
+    assert metrics["skipped_minibatches"] == 0 and metrics["gradient_norm"] > 0
+
+
+def test_a_memory_may_hold_integers():
+    def apply(params, observation, carry):
+        output, memory = NETWORKS[True].apply(params, observation, carry["memory"])
+        return output, {"memory": memory, "count": carry["count"] + 1}
+
+    counting = altered(
+        NETWORKS[True], lambda params, memory: (params, {"memory": memory, "count": jnp.int32(0)})
+    )._replace(apply=apply)
+    state = INIT(CONFIG, Walk(), counting, jax.random.key(0))
+    state, metrics = UPDATE(CONFIG, Walk(), counting, state)
+    assert state.carry["count"].dtype == jnp.int32 and metrics["skipped_minibatches"] == 0
+    evaluation.evaluate(CONFIG, Walk(), counting, state, jax.random.key(1), 2)
 
 
 @pytest.mark.parametrize(

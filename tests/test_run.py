@@ -1,5 +1,7 @@
 """The run command: the same bits however it is interrupted, and one line for every mistake."""
 
+import dataclasses
+import errno
 import importlib.util
 import json
 import os
@@ -11,11 +13,13 @@ import tempfile
 import time
 from pathlib import Path
 
+import jax
 import pytest
 
-from purerl import checkpoint, recorder, run, train
+from purerl import checkpoint, errors, launch, recorder, run, rundir, snapshot, train
 from purerl.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
-from purerl.experiment import Evaluation, load
+from purerl.experiment import Evaluation, find, load
+from purerl.shards import Shards
 
 TOY = Path(__file__).parent / "toy_experiment.py"
 ROOT = TOY.parent.parent
@@ -161,6 +165,47 @@ def test_a_damaged_checkpoint_is_told_and_the_run_is_still_the_same(
     assert start(tmp_path, "--checkpoints", "4", "--resume") == SUCCESS
     assert lines(tmp_path) == lines(whole)
     assert "is damaged: its metadata cannot be read" in capsys.readouterr().out
+
+
+def test_a_run_without_a_whole_checkpoint_does_not_silently_begin_again(
+    tmp_path, stop_after, capsys
+):
+    stop_after(14)
+    start(tmp_path, "--checkpoints", "4")
+    for update in checkpoints(tmp_path):
+        file = folder(tmp_path) / "checkpoints" / f"{update:012d}" / "meta" / "metadata"
+        file.write_text(file.read_text()[:-20])
+    before = lines(tmp_path)
+    stop_after(10**9)
+    capsys.readouterr()
+    for _ in range(2):
+        said = refused(capsys, start(tmp_path, "--checkpoints", "4", "--resume"))
+        assert "no whole checkpoint" in said and "damaged-0-" in said and "another --name" in said
+    assert lines(tmp_path) == before
+
+
+def test_a_run_killed_in_its_first_save_begins_as_it_did(whole, tmp_path, stop_after):
+    stop_after(0)
+    start(tmp_path, "--checkpoints", "4")
+    assert checkpoints(tmp_path) == []
+    (folder(tmp_path) / "checkpoints" / "000000000003.orbax-checkpoint-tmp").mkdir(parents=True)
+    stop_after(10**9)
+    assert start(tmp_path, "--checkpoints", "4", "--resume") == SUCCESS
+    assert lines(tmp_path) == lines(whole)
+
+
+@pytest.mark.parametrize("num_shards", [1, 2])
+def test_a_beginning_has_the_same_bits_however_it_is_compiled(num_shards):
+    chosen = find("cartpole_swingup").experiment
+    chosen = dataclasses.replace(chosen, engine="c", evaluation=Evaluation(number=0))
+    setup = rundir.build(chosen)
+    digests = set()
+    for fresh in (True, False):  # ahead of time, or when it is called
+        programs = launch.compile_programs(
+            setup, chosen.evaluation, fresh, 1, Shards(num_shards, 1)
+        )
+        digests.add(snapshot.digest(programs.init(jax.random.key(1))))
+    assert len(digests) == 1
 
 
 @pytest.mark.parametrize("signals", [[signal.SIGKILL], [signal.SIGTERM]])
@@ -364,6 +409,32 @@ def test_a_run_begun_under_other_conditions_lists_them(tmp_path, stop_after, cap
     assert start(tmp_path, *words, "--allow-changes") == SUCCESS
     allowed = json.loads(file.read_text())["allowed_changes"]
     assert allowed[0]["after_update"] > 0 and len(allowed[0]["changes"]) == 2
+
+
+def test_changes_that_no_checkpoint_fits_leave_the_run_as_it_was(tmp_path, stop_after, capsys):
+    stop_after(9)
+    start(tmp_path)
+    before = [f.read_bytes() for f in sorted(folder(tmp_path).glob("*.json"))]
+    words = ["--resume", "--allow-changes", "--ppo.num-envs", "4", "--ppo.num-steps", "400"]
+    assert "is of another state" in refused(capsys, start(tmp_path, *words))
+    assert [f.read_bytes() for f in sorted(folder(tmp_path).glob("*.json"))] == before
+
+
+def test_ctrl_c_before_anything_has_begun_is_no_traceback():
+    def interrupted():
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit) as ended:
+        errors.leave(interrupted)
+    assert ended.value.code == 128 + signal.SIGINT
+
+
+def test_a_disk_that_is_full_at_the_start_is_one_line(tmp_path, monkeypatch, capsys):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device", "experiment.py")
+
+    monkeypatch.setattr(rundir.shutil, "copyfile", full)
+    assert "experiment.py cannot be written: No space" in refused(capsys, start(tmp_path))
 
 
 @pytest.mark.parametrize(
