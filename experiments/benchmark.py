@@ -32,6 +32,7 @@ import jax.numpy as jnp
 from experiments import start_up
 from purerl import cli, kernels, learner, ppo, run, rundir
 from purerl.console import size
+from purerl.errors import leave
 from purerl.evaluation import evaluate
 from purerl.experiment import Experiment, find
 from purerl.model import scale_action
@@ -249,4 +250,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    leave(lambda: main(sys.argv[1:]))

@@ -37,6 +37,7 @@ from experiments.benchmark import Part, measure
 from experiments.peers import Ours
 from purerl import compilation, kernels, networks, rundir
 from purerl.config import Config
+from purerl.errors import leave
 from purerl.experiment import Evaluation, Experiment
 from purerl.types import Array, PyTree
 
@@ -284,4 +285,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    leave(lambda: main(sys.argv[1:]))

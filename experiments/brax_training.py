@@ -31,6 +31,7 @@ import numpy as np
 from experiments.brax_peer import BODIES, Published, our_experiment, resize, train_brax
 from purerl import compilation, kernels, rundir, statistics
 from purerl.compilation import Programs
+from purerl.errors import leave
 from purerl.experiment import Evaluation
 
 NUM_EPISODES = 128
@@ -239,4 +240,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    leave(lambda: main(sys.argv[1:]))

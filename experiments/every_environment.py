@@ -9,7 +9,6 @@ observations and resets included), and the rollout's share; both timed in turns 
 
 import argparse
 import dataclasses
-import sys
 from functools import partial
 
 import jax
@@ -19,7 +18,7 @@ from envs.suite.tasks import Options as SuiteOptions
 from experiments.benchmark import bare_physics, compile_part, measure
 from purerl import ppo, rundir
 from purerl.env import check_env
-from purerl.errors import one_line
+from purerl.errors import UserError, leave, one_line
 from purerl.experiment import Experiment, find
 from purerl.rollout import rollout
 
@@ -80,11 +79,11 @@ def main() -> int:
             one = sized(experiments[name], engine, options.num_envs, options.length)
             try:
                 line = row(name, one, engine, options.rounds)
-            except ValueError as error:
+            except (ValueError, UserError) as error:
                 line, broken = ROW.format(name, engine, "BROKEN", *"   ") + one_line(error), 1
             print(line, flush=True)
     return broken
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main)

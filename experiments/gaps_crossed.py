@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from purerl import rundir
-from purerl.errors import UserError
+from purerl.errors import UserError, leave
 from purerl.evaluation import evaluate
 from purerl.keys import Purpose, derive
 from purerl.types import Array, Network, Normal, PolicyOutput, TrainState
@@ -86,6 +86,8 @@ def main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     trained = rundir.restore(options.run, "latest", print, options.engine)
     setup, state = trained.setup, trained.saved.state
+    if "gaps_crossed_count" not in jax.eval_shape(setup.env.reset, jax.random.key(0)).metrics:
+        raise UserError(f"{options.run} runs where there are no gaps; give a run in a corridor.")
     policies = {"trained": (setup, state)}
     if options.floor_run:
         floor = rundir.restore(options.floor_run, "latest", print, options.engine)
@@ -104,7 +106,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(sys.argv[1:]))
-    except UserError as error:
-        sys.exit(f"purerl: {error}")
+    leave(lambda: main(sys.argv[1:]))

@@ -32,6 +32,7 @@ from experiments.benchmark import Part, Timing, measure
 from experiments.gymnasium_ant import experiment
 from purerl import ppo, rundir
 from purerl.config import Config
+from purerl.errors import leave
 from purerl.networks import MlpOptions
 
 
@@ -189,4 +190,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    leave(lambda: main(sys.argv[1:]))

@@ -25,6 +25,7 @@ import jax
 
 from experiments.benchmark import compile_part, measure
 from purerl import ppo, rundir
+from purerl.errors import leave
 from purerl.experiment import Experiment, find
 
 AXES: dict[str, tuple[int, ...]] = {
@@ -138,4 +139,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    leave(lambda: main(sys.argv[1:]))

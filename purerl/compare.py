@@ -68,11 +68,17 @@ def compare_runs(options: Options) -> tuple[dict[str, Any], list[Any]]:
     if not options.runs:
         raise UserError("Give the runs to compare: python -m purerl.compare RUN RUN ...")
     runs = [history.read(path) for path in history.find_runs(options.runs)]
-    history.check_metric(runs, options.metric)
     pairs = [twins.compare(a, b) for a, b in twins.twins(runs)]
     found = groups.make_groups(runs, options.group_by)
-    summaries = [groups.summarize(group, options.metric) for group in found]
-    groups.check_scored(summaries, options.metric)
+    summaries, unscored = [], ""
+    try:
+        history.check_metric(runs, options.metric)
+        summaries = [groups.summarize(group, options.metric) for group in found]
+        groups.check_scored(summaries, options.metric)
+    except UserError as error:
+        if not pairs:
+            raise
+        found, summaries, unscored = [], [], str(error)  # whether bits are equal can still be told
     against = [groups.versus(group, found[0], options.metric) for group in found[1:]]
     curves = [groups.learning_curve(group, options.metric) for group in found]
     result = {
@@ -81,6 +87,7 @@ def compare_runs(options: Options) -> tuple[dict[str, Any], list[Any]]:
         "settings_that_differ": groups.differing(runs),
         "conditions_that_differ": conditions(runs),
         "pairs": [pair._asdict() for pair in pairs],
+        "unscored": unscored,
         "groups": [as_json(summary) for summary in summaries],
         "versus_first": [as_json(v) for v in against if v is not None],
     }
@@ -112,6 +119,8 @@ def describe(result: dict[str, Any]) -> list[str]:
     for name, values in result["settings_that_differ"].items():
         lines.append(f"differs: {name} is {' | '.join(map(str, values))}")
     lines += [f"other conditions: {line}" for line in result["conditions_that_differ"]]
+    if result["unscored"]:
+        return [*lines, f"No scores: {result['unscored']}"]
     lines += table(group_rows(result["groups"]))
     if result["versus_first"]:
         lines += ["", f"against {result['versus_first'][0]['baseline']}:"]

@@ -1,5 +1,6 @@
 """The hyperparameters of PPO: pure data, checked when made."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -66,6 +67,10 @@ class Config:
         for name in ("learning_rate", "clip", "max_gradient_norm", "desired_kl", "reward_scale"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be above 0.")
+        for name in ("value_clip", "value_weight", "entropy_weight"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 <= value < math.inf:
+                raise ValueError(f"{name} is {value}; it must be 0 or above, and finite.")
         _check_budget(self)
         check_pool(self)
 

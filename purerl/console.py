@@ -106,7 +106,8 @@ def figures(record: Record, seconds_left: float, steps_per_second: float) -> str
     """Returns a chunk's figures as a person reads them."""
     value = record.get("train/episode_return")
     shown = "-" if value is None else f"{value:.2f}"
-    left = f"{seconds_left // 3600:.0f}:{seconds_left % 3600 // 60:02.0f}:{seconds_left % 60:02.0f}"
+    minutes, seconds = divmod(round(seconds_left), 60)
+    left = f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"
     return (
         f"steps {record['steps']:,}  return {shown}  {steps_per_second:,.0f} steps/s  left {left}"
     )

@@ -81,15 +81,17 @@ class CEngine:
 
 
 def _movable(model: mujoco.MjModel, names: tuple[str, ...]) -> mujoco.MjModel:
-    """Returns a model that heeds changed frames.
+    """Returns a model that heeds changed frames and sizes.
 
     The compiler marks geoms and sites that coincide with their body (`geom_sameframe`), and MuJoCo
-    then never reads their own frame, which would make a change of it do nothing.
+    then never reads their own frame, which would make a change of it do nothing. It also bounds the
+    geoms of a body by volumes of its own, and finds no contact outside of those (midphase).
     """
-    if not any(n.endswith(("_pos", "_quat", "_ipos", "_iquat")) for n in names):
+    if not any(n.endswith(("_pos", "_quat", "_ipos", "_iquat", "_size", "_aabb")) for n in names):
         return model
     model = copy.copy(model)
     model.geom_sameframe[:] = model.site_sameframe[:] = model.body_sameframe[:] = 0
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
     return model
 
 

@@ -35,17 +35,13 @@ class JaxEngine:
           substeps: physics steps in one control step.
 
         Raises:
-          ValueError: the model asks for the slip solver, which MJX leaves out without a word.
+          ValueError: MJX refuses the model, or would leave out a part of it without a word.
         """
-        if model.opt.noslip_iterations:
-            raise ValueError(
-                f"The model has noslip_iterations = {model.opt.noslip_iterations}, which MJX does "
-                "not have: set it to 0, on every engine, or use engine 'c'."
-            )
+        check_known(model)
         self.record, self.late, self.substeps = record, late, substeps
         self.shapes = reading_shapes(model, record._fields)
         with mjx_defaults():
-            self.model = mjx.put_model(model, impl="jax")
+            self.model = put_model(model, "jax")
             self.data = mjx.make_data(model, impl="jax")
         self._traces: dict[Any, core.ClosedJaxpr] = {}
         self._functions: dict[Any, Callable] = {}
@@ -109,6 +105,35 @@ class JaxEngine:
     def _read(self, data: mjx.Data) -> list[Array]:
         fields = self.record._fields
         return [jnp.reshape(field_of(data, n), self.shapes[n]).astype(jnp.float32) for n in fields]
+
+
+def check_known(model: mujoco.MjModel) -> None:
+    """Raises ValueError for what MJX leaves out silently: the motion would be another than C's."""
+    polynomials = ("jnt_stiffnesspoly", "dof_dampingpoly", "tendon_stiffnesspoly")
+    polynomials += ("tendon_dampingpoly",)
+    bits = (mujoco.mjtDisableBit.mjDSBL_SPRING, mujoco.mjtDisableBit.mjDSBL_DAMPER)
+    passive = [bool(model.opt.disableflags & int(bit)) for bit in bits]
+    left_out = {
+        f"noslip_iterations = {model.opt.noslip_iterations}": model.opt.noslip_iterations,
+        "only one of springs and dampers disabled": passive[0] != passive[1],
+    }
+    left_out |= {f"a non-zero {name}": getattr(model, name).any() for name in polynomials}
+    for what, there in left_out.items():
+        if there:
+            raise ValueError(
+                f"The model has {what}, which MJX does not have and leaves out without a word: "
+                "remove it, on every engine, or use engine 'c'."
+            )
+
+
+def put_model(model: mujoco.MjModel, implementation: str) -> mjx.Model:
+    """Puts a model on the device; ValueError if MJX cannot simulate it."""
+    try:
+        return mjx.put_model(model, impl=implementation)
+    except NotImplementedError as error:
+        raise ValueError(
+            f"MJX cannot simulate this model: {error} Change the model, or use engine 'c'."
+        ) from error
 
 
 def reading_shapes(model: mujoco.MjModel, names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:

@@ -31,6 +31,7 @@ from purerl.engine_jax import (  # noqa: E402
     load_state,
     mjx,
     mjx_defaults,
+    put_model,
     reading_shapes,
     save_state,
 )
@@ -192,7 +193,7 @@ def _put_model(model: mujoco.MjModel) -> mjx.Model:
     """
     model = copy.copy(model)
     model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
-    put = mjx.put_model(model, impl="warp")
+    put = put_model(model, "warp")
     return put.replace(opt=put.opt.replace(_impl=put.opt._impl.replace(warn_overflow=0)))
 
 

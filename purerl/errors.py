@@ -47,14 +47,18 @@ def one_line(error: BaseException) -> str:
 
 
 def leave(command: Callable[[], int]) -> NoReturn:
-    """Ends the process with a command's exit code; in silence when its reader has left (`| head`).
+    """Ends the process with a command's exit code, or with that of its error, told in one line.
 
+    In silence when its reader has left (`| head`).
     The code is then the one of a program that SIGPIPE ended; in silence too, with that of SIGINT,
     after Ctrl-C where nothing has begun.
     """
     try:
         code = command()
         sys.stdout.flush()
+    except (UserError, RunError) as error:
+        print(f"purerl: {error}", file=sys.stderr)
+        code = error.exit_code
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more
         code = 128 + signal.SIGPIPE

@@ -60,6 +60,8 @@ def evaluate_run(options: Options) -> dict[str, Any]:
 
     if options.episodes < 1:
         raise UserError(f"episodes is {options.episodes}; it must be at least 1.")
+    if options.json is not None and not options.json.absolute().parent.is_dir():
+        raise UserError(f"{options.json} cannot be written: there is no such folder.")
     run = restore(options.run, options.checkpoint, lambda line: print(line), options.engine)
     config, env, network, engine = run.setup
 

@@ -4,13 +4,15 @@ This module imports nothing heavy, so that a list of experiments or a help page 
 """
 
 import ast
+import contextlib
 import dataclasses
 import enum
 import importlib
 import importlib.util
+import re
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -91,7 +93,8 @@ def available() -> dict[str, Path]:
     Scripts stand beside them: an experiment is a file that gives its `experiment` a value.
     """
     files = [file for folder in reversed(folders()) for file in sorted(folder.glob("*.py"))]
-    return {file.stem: file for file in files if "\nexperiment = " in file.read_text()}
+    gives = re.compile(r"^experiment(: *Experiment)? = ", re.MULTILINE)
+    return {file.stem: file for file in files if gives.search(file.read_text())}
 
 
 def summary(path: Path) -> str:
@@ -132,26 +135,42 @@ def _execute(module_name: str, path: Path) -> ModuleType:
     assert spec is not None and spec.loader is not None  # it is an existing .py file
     module = importlib.util.module_from_spec(spec)
     sys.modules[module_name] = module  # dataclasses and help texts look their module up
-    try:
+    with _mistakes(str(path)):
         spec.loader.exec_module(module)
-    except SyntaxError as error:
-        raise UserError(f"{path}, line {error.lineno}: {error.msg}.") from error
-    except Exception as error:  # the file is a person's own: its line is what they need to see
-        frames = traceback.extract_tb(error.__traceback__)
-        lines = [frame.lineno for frame in frames if frame.filename == spec.origin]
-        where = f", line {lines[-1]}" if lines else ""
-        raise UserError(f"{path}{where}: {one_line(error)}") from error
     return module
+
+
+@contextlib.contextmanager
+def _mistakes(file: str) -> Iterator[None]:
+    """Turns an error in a person's own file into one line with the line that they need to see."""
+    try:
+        yield
+    except SyntaxError as error:
+        raise UserError(f"{error.filename}, line {error.lineno}: {error.msg}.") from error
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        lines = [frame.lineno for frame in frames if frame.filename == file]
+        where = f", line {lines[-1]}" if lines else ""
+        raise UserError(f"{file}{where}: {one_line(error)}") from error
 
 
 def _from_module(name: str) -> Source:
     try:
+        spec = importlib.util.find_spec(name)
+    except (ImportError, ValueError):
+        spec = None
+    if spec is None or spec.origin is None:
+        raise unknown("experiment", name, available())
+    path = Path(spec.origin)
+    with _mistakes(spec.origin):
         module = importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        if error.name is None or not name.startswith(error.name):
-            raise  # the module is there, and itself imports something that is not
-        raise unknown("experiment", name, available()) from error
-    return _checked(module, name.rpartition(".")[2], Path(str(module.__file__)))
+        nodes = list(ast.walk(ast.parse(path.read_text())))
+    if any(isinstance(node, ast.ImportFrom) and node.level for node in nodes):
+        raise UserError(
+            f"{path} imports relatively (from . import ...), and a run keeps a copy of the file "
+            "that has to work alone: import by the full name."
+        )
+    return _checked(module, name.rpartition(".")[2], path)
 
 
 def _checked(module: ModuleType, name: str, path: Path) -> Source:
@@ -207,22 +226,24 @@ def from_json(template: Any, values: Any, path: str = "") -> Any:
     if dataclasses.is_dataclass(template) and not isinstance(template, type):
         names = [f.name for f in dataclasses.fields(template) if f.init and f.name not in BUILDERS]
         _check_names(names, values, path)
-        inner = {n: from_json(getattr(template, n), values[n], _join(path, n)) for n in names}
+        read = {n: from_json(getattr(template, n), values[n], _join(path, n)) for n in names}
         try:
-            return dataclasses.replace(template, **inner)
+            return dataclasses.replace(template, **read)
         except ValueError as error:
             raise UserError(f"{path or 'experiment'}: {error}") from error
     if isinstance(template, enum.Enum):
         return type(template)[values]
     if isinstance(template, Path):
         return Path(values)
-    if isinstance(values, list) and not isinstance(template, list):
-        return _as_tuple(values)
+    if isinstance(values, dict):
+        known = template if isinstance(template, dict) else {}
+        return {k: from_json(known.get(k), v, _join(path, k)) for k, v in values.items()}
+    if isinstance(values, list):
+        like = list(template) if isinstance(template, list | tuple) and template else [None]
+        like += like[-1:] * (len(values) - len(like))  # what is longer goes on like the last
+        inner = [from_json(t, v, f"{path}[]") for t, v in zip(like, values, strict=False)]
+        return inner if isinstance(template, list) else tuple(inner)
     return values
-
-
-def _as_tuple(values: Any) -> Any:
-    return tuple(_as_tuple(v) for v in values) if isinstance(values, list) else values
 
 
 def _join(path: str, name: str) -> str:

@@ -188,4 +188,7 @@ def learning_curve(group: Group, metric: str) -> Curve | None:
 def check_scored(summaries: Sequence[Summary], metric: str) -> None:
     """Raises UserError if no run has anything to compare."""
     if not any(summary.n for summary in summaries):
-        raise UserError(f"No run that is done has a value of {metric}; choose another --metric.")
+        raise UserError(
+            f"No run that is done has a value of {metric}: let one come to its end, or choose "
+            "another --metric."
+        )

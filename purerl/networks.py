@@ -38,6 +38,10 @@ class MlpOptions:
     initial_std: float = 0.6
     """Policy scale before training, in raw-action units."""
 
+    def __post_init__(self) -> None:
+        """Raises ValueError for a scale that is none."""
+        _check_std(self.initial_std)
+
 
 @dataclass(frozen=True)
 class RecurrentOptions:
@@ -57,6 +61,34 @@ class RecurrentOptions:
     """Policy scale: one learned vector, or a function of the observation."""
     initial_std: float = 0.6
     """Policy scale before training, in raw-action units."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a scale that is none."""
+        _check_std(self.initial_std)
+
+
+def _check_std(initial_std: float) -> None:
+    if not MIN_SCALE <= initial_std <= 100.0:
+        raise ValueError(f"initial_std is {initial_std}; it must be from {MIN_SCALE} to 100.")
+
+
+def check_observation(observation: PyTree) -> None:
+    """Raises ValueError unless an observation is an array [O], or a flat dict of such."""
+    parts = observation if isinstance(observation, dict) else {"policy": observation}
+    if "policy" not in parts:
+        raise ValueError(
+            f"The observation is a dict of {', '.join(sorted(parts))}; the entry that the policy "
+            "may read must be called policy (the value function reads all)."
+        )
+    for name, part in parts.items():
+        if getattr(part, "ndim", None) != 1:
+            what = (
+                f"of shape {part.shape}" if hasattr(part, "shape") else f"a {type(part).__name__}"
+            )
+            raise ValueError(
+                f"The observation's part {name} is {what}; this network takes arrays [O]: flatten "
+                "it, or write a network of your own (experiments/custom_network.py)."
+            )
 
 
 def policy_features(observation: PyTree) -> Array:
@@ -156,6 +188,8 @@ def from_linen(module: nn.Module, observation: PyTree, carry: PyTree = ()) -> Ne
       carry: one environment's memory at the start of an episode, leaves [H], all zeros.
     """
     recurrent = len(jax.tree.leaves(carry)) > 0
+    if any(jnp.any(x != 0) for x in jax.tree.leaves(carry)):
+        raise ValueError("A memory starts an episode at zero; this carry has other numbers in it.")
     arguments = (observation, carry) if recurrent else (observation,)
 
     def init(key: Array) -> tuple[PyTree, PyTree]:
@@ -172,11 +206,13 @@ def from_linen(module: nn.Module, observation: PyTree, carry: PyTree = ()) -> Ne
 
 def mlp(options: MlpOptions, observation: PyTree, action_size: int) -> Network:
     """Builds the default network for one `observation` (leaves [O]) and `action_size` A."""
+    check_observation(observation)
     return from_linen(MlpActorCritic(options, action_size), observation)
 
 
 def recurrent(options: RecurrentOptions, observation: PyTree, action_size: int) -> Network:
     """Builds the GRU or LSTM network for one `observation` (leaves [O]) and `action_size` A."""
+    check_observation(observation)
     memory = jnp.zeros(options.hidden)
     carry = memory if options.cell == "gru" else (memory, memory)
     return from_linen(RecurrentActorCritic(options, action_size), observation, carry)

@@ -96,7 +96,8 @@ class Physics:
     (`{"geom_friction": [ngeom, 3]}`). Fields are set as they are: constants that the model
     compiler derives from them (`body_invweight0`, `body_subtreemass`, ... of `mj_setConst`) do not
     follow, on any engine; change those beside them where it matters (for the mass of a lone free
-    body `dof_M0` too, which the C code reads).
+    body `dof_M0` too, which the C code reads; the centre of mass of a lone free body cannot follow
+    `body_ipos`: put it into a body of its own).
 
     A simulation that blows up, or is given NaN, returns NaN and touches no other.
 
@@ -146,15 +147,16 @@ class Physics:
         model, changes = self.model, self._check_changes(changes)
         _check_shape("qpos", qpos, (model.nq,))
         _check_shape("qvel", qvel, (model.nv,))
-        mocap = [int(np.flatnonzero(model.body_mocapid == i)[0]) for i in range(model.nmocap)]
+        mocap = np.array([np.flatnonzero(model.body_mocapid == i)[0] for i in range(model.nmocap)])
+        mocap = mocap.astype(int)
         state = PhysicsState(
             qpos=_float32(qpos),
             qvel=_float32(qvel),
             act=jnp.zeros(model.na, jnp.float32),
             time=jnp.zeros((), jnp.float32),
             qacc_warmstart=jnp.zeros(model.nv, jnp.float32),
-            mocap_pos=_float32(model.body_pos[mocap].reshape(-1, 3)),
-            mocap_quat=_float32(model.body_quat[mocap].reshape(-1, 4)),
+            mocap_pos=_float32(changes.get("body_pos", model.body_pos))[mocap],
+            mocap_quat=_float32(changes.get("body_quat", model.body_quat))[mocap],
         )
         return state, self._engine.init(state, changes)
 
@@ -171,7 +173,24 @@ class Physics:
                 what = "model field that can change"
                 raise ValueError(unknown_name(what, name, CHANGEABLE_FIELDS))
             _check_shape(f"changes[{name!r}]", value, getattr(self.model, name).shape)
+            _check_has_effect(self.model, name, self.engine)
         return {name: _float32(value) for name, value in (changes or {}).items()}
+
+
+def _check_has_effect(model: mujoco.MjModel, name: str, engine: str) -> None:
+    """Raises for a field that an engine heeds only where the model was compiled with some of it."""
+    value = getattr(model, name)
+    if name == "body_gravcomp" and not value.any():
+        missing = "some body"
+    elif engine == "jax" and name.endswith("_frictionloss") and not value.all():
+        missing = "all of them"
+    elif engine == "jax" and name.endswith("poly"):
+        raise ValueError(f"changes[{name!r}] does nothing on engine 'jax': MJX does not have it.")
+    else:
+        return
+    raise ValueError(
+        f"changes[{name!r}] would do nothing: compile the model with {name} above 0 for {missing}."
+    )
 
 
 def choose_engine(engine: str) -> str:

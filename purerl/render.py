@@ -118,7 +118,7 @@ def play(run: Any, options: Options) -> Any:
     from purerl.video import record
 
     config, env, network, _ = run.setup
-    steps = max(1, min(round(options.seconds / env.control_timestep), config.episode_length))
+    steps = max(1, round(min(options.seconds / env.control_timestep, config.episode_length)))
     key = derive(jax.random.key(options.seed), Purpose.VIDEO)
     played = jax.jit(
         functools.partial(

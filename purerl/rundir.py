@@ -112,12 +112,16 @@ def check_new_or_resume(folders: Iterable[Path], resume: bool) -> None:
 
 
 def describe(source: Source, chosen: Experiment, schedule: dict[str, Any]) -> dict[str, Any]:
-    """Returns config.json: every setting of the run."""
-    return {
-        "experiment": source.name,
-        "settings": experiment.to_json(experiment.settings(chosen)),
-        "schedule": schedule,
-    }
+    """Returns config.json: every setting of the run; UserError if one cannot be read back."""
+    settings = experiment.to_json(experiment.settings(chosen))
+    rebuilt = experiment.from_json(source.experiment, settings)
+    for name, value in experiment.settings(chosen).items():
+        if (read := getattr(rebuilt, name)) != value:
+            raise UserError(
+                f"config.json cannot hold {name}: {value} would be read back as {read}. Give what "
+                "the experiment's file may leave empty (None, or ()) a value of its own kind there."
+            )
+    return {"experiment": source.name, "settings": settings, "schedule": schedule}
 
 
 def start(folder: Path, source: Source, settings: dict[str, Any], facts: dict[str, Any]) -> None:

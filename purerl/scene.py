@@ -225,10 +225,10 @@ def default_camera(model: Any) -> int | None:
 
 
 def root_body(model: Any) -> int:
-    """Returns the child of the world with the most bodies below it; the heaviest of equals."""
+    """Returns the child of the world with the most moving bodies; the heaviest of equals."""
     below = [0] * model.nbody
     for body in range(1, model.nbody):
-        below[model.body_rootid[body]] += 1
+        below[model.body_rootid[body]] += int(model.body_weldid[body] != 0)
     return max(range(model.nbody), key=lambda i: (below[i], model.body_subtreemass[i]))
 
 

@@ -193,6 +193,15 @@ def test_under_other_conditions_a_difference_is_no_fault(tmp_path, capsys):
     assert "other conditions: engine: c -> jax" in capsys.readouterr().out
 
 
+def test_bits_are_compared_without_a_score(tmp_path, capsys):
+    for name, digest in (("a", "d1"), ("b", "e1")):
+        make_run(tmp_path / "runs" / name, 1, [1.0, 2.0], digests=[digest])
+    result = found(tmp_path, tmp_path / "runs", "--metric", "eval/none", code=FAILURE)
+    assert result["pairs"][0]["same"] is False and result["groups"] == []
+    said = capsys.readouterr().out
+    assert "not at update 1" in said and "No scores: " in said and "eval/none" in said
+
+
 def test_runs_that_promise_no_bits_may_differ(tmp_path):
     for name, digest in (("a", "d1"), ("b", "e1")):
         make_run(tmp_path / "runs" / name, 1, [1.0] * 4, digests=[digest], bit_exact=False)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from purerl import experiment
+from purerl import experiment, rundir
 from purerl.errors import UserError
 
 TOY = Path(__file__).parent / "toy_experiment.py"
@@ -59,6 +59,51 @@ def test_settings_survive_json():
     changed = dataclasses.replace(chosen, seed=7, network=network)
     values = json.loads(json.dumps(experiment.to_json(changed)))
     assert experiment.from_json(chosen, values) == changed
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    size: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Parts:
+    several: tuple[Part, ...] = (Part(),)
+    named: dict = dataclasses.field(default_factory=lambda: {"a": (1, 2)})
+    one: Part | None = None
+
+
+def test_dataclasses_in_tuples_and_tuples_in_dicts_survive_json():
+    chosen = dataclasses.replace(experiment.load(TOY).experiment, env=Parts())
+    env = Parts(several=(Part(2.0), Part(3.0)), named={"a": (3, 4), "b": (5,)})
+    changed = dataclasses.replace(chosen, env=env)
+    values = json.loads(json.dumps(experiment.to_json(changed)))
+    assert experiment.from_json(chosen, values) == changed
+
+
+def test_a_setting_that_could_not_be_read_back_is_refused_before_training():
+    source = experiment.load(TOY)
+    source = source._replace(experiment=dataclasses.replace(source.experiment, env=Parts()))
+    rundir.describe(source, source.experiment, {})
+    chosen = dataclasses.replace(source.experiment, env=Parts(one=Part()))
+    with pytest.raises(UserError, match="cannot hold env: .*one=Part"):
+        rundir.describe(source, chosen, {})
+
+
+def test_a_mistake_in_a_module_names_its_line(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "mods").mkdir()
+    for i, (text, message) in enumerate([
+        ("x = 1\ny = 1 / 0\n", "line 2: ZeroDivisionError"),
+        ("x = = 1\n", "line 1"),
+        ("import no_such_thing\n", "line 1: .*no_such_thing"),
+        ("from . import mod0\n", "imports relatively"),
+    ]):  # fmt: skip
+        (tmp_path / "mods" / f"mod{i}.py").write_text(text)
+        if "imports" in message:
+            (tmp_path / "mods" / "mod0.py").write_text("")
+        with pytest.raises(UserError, match=message):
+            experiment.find(f"mods.mod{i}")
 
 
 def test_missing_and_unknown_settings_are_named():

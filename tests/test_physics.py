@@ -227,6 +227,83 @@ def test_changes_are_each_environments_own(engine):
         np.testing.assert_array_equal(plain.qpos[0], plain.qpos[1])
 
 
+def pedestal(x, extra=""):
+    """Four boxes, of which one at x, and a body of four geoms that falls from above the origin."""
+    return mujoco.MjModel.from_xml_string(f"""<mujoco>{extra}<worldbody>
+      <geom name="pedestal" type="box" size=".3 .3 .1" pos="{x} 0 .1"/>
+      <geom type="box" size=".3 .3 .1" pos="4 0 .1"/>
+      <geom type="box" size=".3 .3 .1" pos="4 2 .1"/>
+      <geom type="box" size=".3 .3 .1" pos="4 -2 .1"/>
+      <body pos="0 0 .4"><freejoint/>
+        <geom type="capsule" size=".05" fromto="-.2 0 0 .2 0 0"/>
+        <geom type="capsule" size=".05" fromto="0 -.2 0 0 .2 0"/>
+        <geom type="sphere" size=".06" pos=".2 0 0"/>
+        <geom type="sphere" size=".06" pos="-.2 0 0"/>
+      </body></worldbody></mujoco>""")
+
+
+def fall(model, changes):
+    """Height [m] of the body after 1 s on `c`."""
+    physics = Physics(model, (), 500, "c")
+    state, _ = physics.init(model.qpos0, jnp.zeros(model.nv), changes)
+    return float(physics.step(state, jnp.zeros(0), changes)[0].qpos[2])
+
+
+def test_a_geom_that_changes_put_somewhere_is_touched_there():
+    away = pedestal(-4.0)
+    moved = {"geom_pos": jnp.float32(away.geom_pos).at[away.geom("pedestal").id, 0].set(0.0)}
+    assert fall(pedestal(0.0), None) == pytest.approx(0.26, abs=0.01)
+    assert fall(away, moved) == pytest.approx(0.26, abs=0.01)
+    assert fall(away, None) < 0.0
+
+
+def test_a_mocap_body_starts_where_changes_put_it():
+    bodies = "<body mocap='true' pos='1 0 0'/><body mocap='true'/>"
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    physics = Physics(model, (), 1, "c")
+    changes = {"body_pos": jnp.float32(model.body_pos).at[2].set(jnp.arange(3.0))}
+    state, _ = physics.init(jnp.zeros(0), jnp.zeros(0), changes)
+    np.testing.assert_array_equal(state.mocap_pos, [[1, 0, 0], [0, 1, 2]])
+
+
+HINGE = """<mujoco>{0}<worldbody><body><joint type="hinge" axis="0 1 0" {1}/>
+  <geom type="capsule" size=".05" fromto="0 0 0 .5 0 0"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("option", "joint", "message"),
+    [
+        ("", 'damping="0 2 1"', "non-zero dof_dampingpoly"),
+        ("", 'stiffness="0 5 50"', "non-zero jnt_stiffnesspoly"),
+        ('<option><flag spring="disable"/></option>', 'damping="2"', "only one of springs"),
+    ],
+)
+def test_what_mjx_would_leave_out_is_refused(option, joint, message):
+    model = mujoco.MjModel.from_xml_string(HINGE.format(option, joint))
+    Physics(model, (), 1, "c")
+    with pytest.raises(ValueError, match=message):
+        Physics(model, (), 1, "jax")
+
+
+def test_what_mjx_refuses_is_a_value_error():
+    shapes = "<geom type='cylinder' size='.1 .1'/>", "<geom type='box' size='.1 .1 .1'/>"
+    bodies = "".join(f"<body><freejoint/>{shape}</body>" for shape in shapes)
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    with pytest.raises(ValueError, match="MJX cannot simulate this model.*CYLINDER"):
+        Physics(model, (), 1, "jax")
+
+
+@pytest.mark.parametrize(
+    ("engine", "field"),
+    [("c", "body_gravcomp"), ("jax", "dof_frictionloss"), ("jax", "dof_dampingpoly")],
+)
+def test_changes_that_would_do_nothing_are_refused(engine, field):
+    model = mujoco.MjModel.from_xml_string(HINGE.format("", ""))
+    changes = {field: jnp.ones(getattr(model, field).shape)}
+    with pytest.raises(ValueError, match=f"{field}.*nothing"):
+        Physics(model, (), 1, engine).init(jnp.zeros(1), jnp.zeros(1), changes)
+
+
 def test_wrong_names_and_shapes_are_explained():
     with pytest.raises(ValueError, match="engine 'cpu'.*There are: auto, c, jax, warp"):
         choose_engine("cpu")
@@ -239,7 +316,7 @@ def test_wrong_names_and_shapes_are_explained():
         Physics(suite.load("cartpole", "swingup").physics.model.ptr, ("cfrc_ext",), engine="c")
     slip = biped.__wrapped__()  # its own
     slip.opt.noslip_iterations = 3
-    with pytest.raises(ValueError, match="noslip_iterations = 3, which MJX does not have: set it"):
+    with pytest.raises(ValueError, match="noslip_iterations = 3, which MJX does not have and"):
         Physics(slip, (), engine="jax")
     p = physics("c")
     qpos, qvel = (x[0] for x in starts(1, p.model))

@@ -329,6 +329,32 @@ def test_parameters_of_half_precision_stay_so():
     assert metrics["skipped_minibatches"] == 0 and metrics["gradient_norm"] > 0
 
 
+def unmade(function, *arguments):
+    with pytest.raises(ValueError) as error:
+        function(*arguments)
+    return str(error.value)
+
+
+def test_what_a_network_cannot_read_is_told():
+    zeros = jnp.zeros(2)
+    said = unmade(networks.mlp, MLP, {"state": zeros, "privileged": zeros}, 1)
+    assert "dict of privileged, state" in said and "must be called policy" in said
+    assert "is of shape (3, 2); this network takes arrays [O]" in unmade(
+        networks.recurrent, GRU, jnp.zeros((3, 2)), 1
+    )
+    assert "part eyes is a dict" in unmade(networks.mlp, MLP, {"policy": zeros, "eyes": {}}, 1)
+    assert "initial_std is 0.0" in unmade(lambda: networks.MlpOptions(initial_std=0.0))
+    assert "starts an episode at zero" in unmade(
+        networks.from_linen, networks.RecurrentActorCritic(GRU, 1), zeros, jnp.ones(8)
+    )
+    networks.mlp(MLP, {"policy": zeros, "privileged": zeros}, 1)
+
+
+@pytest.mark.parametrize(("name", "value"), [("value_clip", -1.0), ("entropy_weight", jnp.nan)])
+def test_weights_have_a_sign(name, value):
+    assert name in unmade(lambda: dataclasses.replace(CONFIG, **{name: value}))
+
+
 def test_a_memory_may_hold_integers():
     def apply(params, observation, carry):
         output, memory = NETWORKS[True].apply(params, observation, carry["memory"])

@@ -220,6 +220,15 @@ def test_scenery_shows_and_is_forgotten():
     assert reddish(hidden).sum() == 0
 
 
+def test_furniture_is_not_what_the_camera_follows():
+    shelf = "<body name='shelf'><geom size='1'/><body><geom size='1'/></body></body>"
+    robot = "<body name='robot'><freejoint/><geom size='.1'/></body>"
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><worldbody>{shelf}{robot}</worldbody></mujoco>"
+    )
+    assert model.body(scene.root_body(model)).name == "robot"
+
+
 def test_the_camera_follows_a_free_body_along_the_ground():
     model = room()
     start = [0, 0, 1, 1, 0, 0, 0]

@@ -16,7 +16,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from purerl import checkpoint, errors, launch, recorder, run, rundir, snapshot, train
+from purerl import checkpoint, console, errors, launch, recorder, run, rundir, snapshot, train
 from purerl.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
 from purerl.experiment import Evaluation, find, load
 from purerl.shards import Shards
@@ -427,6 +427,20 @@ def test_ctrl_c_before_anything_has_begun_is_no_traceback():
     with pytest.raises(SystemExit) as ended:
         errors.leave(interrupted)
     assert ended.value.code == 128 + signal.SIGINT
+
+
+def test_an_error_of_any_command_is_one_line_and_its_code(capsys):
+    def mistaken():
+        raise errors.UserError("Give a run.")
+
+    with pytest.raises(SystemExit) as ended:
+        errors.leave(mistaken)
+    assert ended.value.code == USAGE and capsys.readouterr().err == "purerl: Give a run.\n"
+
+
+@pytest.mark.parametrize(("left", "shown"), [(59.7, "0:01:00"), (3599.9, "1:00:00")])
+def test_the_time_left_carries_over(left, shown):
+    assert console.figures({"steps": 1}, left, 1.0).endswith(f"left {shown}")
 
 
 def test_a_disk_that_is_full_at_the_start_is_one_line(tmp_path, monkeypatch, capsys):

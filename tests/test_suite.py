@@ -244,3 +244,12 @@ def test_random_joints_have_their_ranges():
             spread = np.ptp(theirs, axis=0) + 1e-3
             difference = np.abs(statistic(qpos, axis=0) - statistic(theirs, axis=0)) / spread
             assert difference.max() < 0.05
+
+
+def test_a_video_shows_the_target_where_the_episode_has_it():
+    env = tasks.build(tasks.Options(task="reacher-hard"), "c")
+    state = env.reset(jax.random.key(1))
+    target = env.physics.model.geom("target").id
+    shown = env.model_changes(state)["geom_pos"][target]
+    assert np.abs(shown - env.physics.model.geom_pos[target]).max() > 0.01
+    np.testing.assert_allclose(shown[:2], state.task["geom_pos"][target, :2])

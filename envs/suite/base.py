@@ -80,8 +80,12 @@ class SuiteEnv:
     def step(self, state: State, action: Array) -> State:
         """Advances one control step; action [A] in [-1, 1]."""
         ctrl = lookup.scale_action(self.physics.model, action)
-        physics, readings = self.physics.step(state.physics, ctrl, state.task)
+        physics, readings = self.physics.step(state.physics, ctrl, self.model_changes(state))
         return self.state(physics, readings, ctrl, state.task)
+
+    def model_changes(self, state: State) -> dict[str, Array]:
+        """Returns this episode's model fields, such as where a target is (for a video too)."""
+        return state.task
 
     def state(self, physics: PhysicsState, readings, ctrl: Array, changes: dict) -> State:
         """Observes and rewards a moment."""

@@ -1,4 +1,4 @@
-"""Every task of the suite by its name, `<domain>-<task>`."""
+"""The tasks of the suite by their names, `<domain>-<task>`."""
 
 from dataclasses import dataclass
 from typing import Any, Literal
