@@ -6,7 +6,7 @@ Expected after 12 M steps (71 min on two CPU cores with other work beside it), i
 corridors: 3.0 gaps crossed on average, one or more in all, five or more in 23%, at most 12; the
 policy of `rodent_run`, which does not see them, 1.1; standing still, none. It leaps, and falls into
 the wide ones. With MJX-Warp 21 M steps take 7 min of an H200 that trains another beside it, and
-end alike (3.4 gaps; one or more in 77%, five or more in 30%); `docs/gpu.md` has what else was tried:
+end alike (3.4 gaps; one or more in 77%, five or more in 30%); `docs/gpu.md` has other tries:
 
 python -m purerl.run rodent_gaps --engine warp --ppo.num-envs 4096 --ppo.rollout-length 16 \
     --ppo.num-minibatches 64 --ppo.num-steps 21000000
