@@ -3,7 +3,7 @@
 python -m purerl.run ant_gaps
 
 Expected: 15 gaps of 19, 5 or more in 89% of unseen corridors, after 4 min on two CPU cores (seeds 2
-and 3: 16 and 17 gaps, 96% and 99%).
+and 3: 16 gaps, 97% and 95%).
 """
 
 from envs import run
