@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from purerl.errors import FAILURE, UserError, leave
+from purerl.errors import FAILURE, UserError, leave, tell
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.out is not None:
             write(options.out, result, curves)
     except UserError as error:
-        print(f"purerl: {error}", file=sys.stderr)
-        return error.exit_code
+        return tell(error)
     broken = [pair for pair in result["pairs"] if pair["same"] is False and pair["promised"]]
     return FAILURE if broken else 0
 

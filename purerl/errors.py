@@ -46,6 +46,12 @@ def one_line(error: BaseException) -> str:
     return text if len(text) > 20 else f"{type(error).__name__}: {text}"
 
 
+def tell(error: UserError | RunError | StoppedError) -> int:
+    """Prints an error as one line and returns its exit code."""
+    print(f"purerl: {error}", file=sys.stderr)
+    return error.exit_code
+
+
 def leave(command: Callable[[], int]) -> NoReturn:
     """Ends the process with a command's exit code, or with that of its error, told in one line.
 
@@ -57,8 +63,7 @@ def leave(command: Callable[[], int]) -> NoReturn:
         code = command()
         sys.stdout.flush()
     except (UserError, RunError) as error:
-        print(f"purerl: {error}", file=sys.stderr)
-        code = error.exit_code
+        code = tell(error)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more
         code = 128 + signal.SIGPIPE

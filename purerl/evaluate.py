@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from purerl.errors import UserError, leave
+from purerl.errors import UserError, leave, tell
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parse(Options, arguments, "python -m purerl.evaluate")
         print("\n".join(describe(evaluate_run(options))))
     except UserError as error:
-        print(f"purerl: {error}", file=sys.stderr)
-        return error.exit_code
+        return tell(error)
     return 0
 
 

@@ -16,6 +16,7 @@ from jax.flatten_util import ravel_pytree
 from purerl import losses
 from purerl.config import Config
 from purerl.keys import Purpose, derive
+from purerl.rollout import select
 from purerl.shards import WHOLE, Shards, add_in_order, move, numbers, total
 from purerl.targets import Batch
 from purerl.types import Array, Metrics, Network, PolicyOutput, PyTree, TrainState
@@ -135,12 +136,7 @@ def unroll(network: Network, params: PyTree, batch: Batch, memory: PyTree) -> Po
 
     def step(memory: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, PolicyOutput]:
         observation, first = row
-        fresh = jax.tree.map(
-            lambda x: jnp.where(
-                jnp.expand_dims(first, tuple(range(1, x.ndim))), jnp.zeros_like(x), x
-            ),
-            memory,
-        )
+        fresh = select(first, jax.tree.map(jnp.zeros_like, memory), memory)
         output, memory = network.apply(params, observation, fresh)
         return memory, output
 

@@ -155,14 +155,14 @@ def imported_files(names: Iterable[str]) -> dict[str, Path]:
         name = todo.pop()
         if name in found or name.partition(".")[0] not in packages:
             continue
-        file = _module_file(name)
+        file = module_file(name)
         if file is not None:
             found[name] = file
             todo += _imports(file)
     return found
 
 
-def _module_file(name: str) -> Path | None:
+def module_file(name: str) -> Path | None:
     """Returns a module's Python file; None for what is no module, such as an imported function.
 
     Imports nothing: `find_spec` of a dotted name would import the module before the dot, and with

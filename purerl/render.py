@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from purerl.errors import RunError, UserError, leave, one_line
+from purerl.errors import RunError, UserError, leave, one_line, tell
 
 SHEET = 4  # rows and columns of the contact sheet
 SHEET_WIDTH = 320  # of each of its images [pixels]
@@ -51,8 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parse(Options, arguments, "python -m purerl.render")
         render_run(options)
     except (UserError, RunError) as error:
-        print(f"purerl: {error}", file=sys.stderr)
-        return error.exit_code
+        return tell(error)
     return 0
 
 

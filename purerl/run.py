@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from purerl import experiment, kernels
-from purerl.errors import USAGE, RunError, StoppedError, UserError, leave
+from purerl.errors import USAGE, RunError, StoppedError, UserError, leave, tell
 from purerl.experiment import Experiment, Source
 
 
@@ -87,10 +87,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         command(arguments)
     except (UserError, RunError, StoppedError) as error:
-        print(f"purerl: {error}", file=sys.stderr)
+        code = tell(error)
         if isinstance(error, StoppedError):
             print(f"Go on with: {resume_command(arguments)}", file=sys.stderr)
-        return error.exit_code
+        return code
     return 0
 
 

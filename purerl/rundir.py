@@ -2,7 +2,6 @@
 
 import contextlib
 import fcntl
-import inspect
 import json
 import os
 import shutil
@@ -192,7 +191,7 @@ def restore(folder: Path, update: str, say: Say, engine: str = "") -> Run:
 def code_changed(folder: Path, source: Source) -> bool:
     """Tells whether the code that the run's own file calls has been edited since the run began."""
     builders = (source.experiment.build_env, source.experiment.build_network)
-    if any(Path(inspect.getfile(builder)) == source.path for builder in builders):
+    if any(manifest.module_file(builder.__module__) == source.path for builder in builders):
         return False  # it is its own copy of that code
     return manifest.source_hash(builders) != read_json(folder / "manifest.json").get("source")
 

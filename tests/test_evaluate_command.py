@@ -90,7 +90,11 @@ def test_settings_that_do_not_fit_the_file_are_named(trained, tmp_path, capsys):
 
 def test_a_setting_and_code_that_came_after_the_run_are_told(tmp_path, capsys):
     file = tmp_path / "later.py"  # with its builders elsewhere
-    file.write_text("from tests.toy_experiment import experiment")
+    file.write_text(
+        "import dataclasses, functools\n"
+        "from tests.toy_experiment import build_env, experiment\n"
+        "experiment = dataclasses.replace(experiment, build_env=functools.partial(build_env))\n"
+    )
     assert run.main([str(file), "--runs", str(tmp_path)]) == 0
     trained = tmp_path / "later" / "seed1"
     result(trained, tmp_path)
