@@ -10,10 +10,7 @@ Zero-size arrays, which Orbax refuses, count in the digest but are not written.
 import contextlib
 import hashlib
 import json
-import logging
-import os
 import shutil
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from purerl import disk
 from purerl.errors import UserError, one_line
 from purerl.snapshot import Leaves, digest_leaves, leaf_paths, unflatten
 from purerl.types import PyTree, is_key
@@ -50,21 +48,13 @@ def save(folder: Path, leaves: Leaves, meta: dict[str, Any]) -> Path:
     Raises:
       OSError or ValueError when the disk refuses; nothing partial is left behind.
     """
-    ocp = _orbax()
     meta = meta | {"leaves": {path: _describe(array) for path, array in leaves.items()}}
     path = folder / f"{meta['update']:012d}"
     discard(path)
     stored = {key: array for key, array in leaves.items() if array.size}
     try:
-        with _checkpointer() as checkpointer:
-            checkpointer.save(
-                path.absolute(),
-                ocp.args.Composite(
-                    state=ocp.args.StandardSave(stored),
-                    meta=ocp.args.JsonSave(meta | {"meta_sha256": _meta_hash(meta)}),
-                ),
-            )
-        _flush(path)
+        disk.write(path, stored, meta | {"meta_sha256": _meta_hash(meta)})
+        disk.flush(path)
     except BaseException:
         discard(path)
         clean(folder)
@@ -85,13 +75,10 @@ def load(path: Path, abstract: PyTree) -> Saved:
     """
     meta = load_meta(path)
     _check_fits(path, meta, abstract)
-    ocp = _orbax()
     leaves = {key: _blank(about) for key, about in meta["leaves"].items()}
     target = {key: array for key, array in leaves.items() if array.size}
     try:
-        with _checkpointer() as checkpointer:
-            arguments = ocp.args.Composite(state=ocp.args.StandardRestore(target))
-            leaves |= checkpointer.restore(path.absolute(), arguments).state
+        leaves |= disk.read(path, target)
     except (PermissionError, MemoryError) as error:  # no damage: it shall not be put aside
         raise UserError(f"The checkpoint {path} cannot be read: {one_line(error)}") from error
     except Exception as error:  # Orbax raises many kinds for broken files, none of them its own
@@ -279,50 +266,3 @@ def _set_aside(path: Path) -> Path:
     while (kept := path.with_name(f"damaged-{count}-{path.name}")).exists():
         count += 1
     return path.rename(kept)
-
-
-def _flush(path: Path) -> None:
-    """Forces a checkpoint to the disk before an older one is deleted: Orbax calls no fsync."""
-    for file in [*path.rglob("*"), path, path.parent]:
-        handle = os.open(file, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
-
-
-def _checkpointer() -> Any:
-    """Returns what saves and loads; of several processes the first does, without the others."""
-    ocp = _orbax()
-    if jax.process_count() == 1:
-        return ocp.Checkpointer(ocp.CompositeCheckpointHandler())
-    alone = ocp.options.MultiprocessingOptions(
-        primary_host=0, active_processes={0}, barrier_sync_key_prefix="first"
-    )
-    handler = ocp.CompositeCheckpointHandler(
-        state=ocp.StandardCheckpointHandler(multiprocessing_options=alone),
-        meta=ocp.JsonCheckpointHandler(multiprocessing_options=alone),
-        composite_options=ocp.CompositeOptions(multiprocessing_options=alone),
-    )
-    return ocp.Checkpointer(handler, multiprocessing_options=alone)
-
-
-def _orbax() -> Any:
-    """Imports Orbax late (0.3 s), and without its running commentary."""
-    for name in ("absl", "asyncio"):  # errors are reported by us, once for a save
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    if sys.unraisablehook is sys.__unraisablehook__:
-        sys.unraisablehook = _print_unraisable
-    import orbax.checkpoint
-
-    return orbax.checkpoint
-
-
-def _print_unraisable(raised: Any) -> None:
-    """Prints what could not be raised, but for the writes that a failed save leaves under way.
-
-    They end one by one in threads of the storage library, each with the same complaint; the save
-    has been reported as failed by then.
-    """
-    if str(raised.exc_value) != "Event loop is closed":
-        sys.__unraisablehook__(raised)

@@ -101,12 +101,10 @@ def compile_programs(
     parts = [("collect", collect), ("improve", improve)] if calls_host else [("update", whole)]
     given, traced, started = (abstract,), [], []
     for name, part in parts:
-        traced.append(jax.jit(part, donate_argnums=0).trace(*given))
+        traced.append(jit(name, part, donate_argnums=0).trace(*given))
         started.append(start(name, traced[-1], seconds))
         given = shapes(traced[-1].out_info)
-    # Wherever it is compiled: at another level of LLVM its bits are others.
-    begin: Any = jax.jit(init, compiler_options=compiler_options("init"))
-    evaluate: Any = jax.jit(judge)
+    begin, evaluate = jit("init", init), jit("evaluation", judge)
     beginning = start("init", begin.trace(key), seconds) if fresh else None
     if evaluation.number:
         evaluate = when_needed("evaluation", evaluate, abstract, seconds)
@@ -132,12 +130,22 @@ def shapes(tree: PyTree, sharding: Any = None) -> PyTree:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), tree)
 
 
+def jit(name: str, function: Callable, **options: Any) -> Any:
+    """Returns `jax.jit` of a run's program, at its level of LLVM wherever it is compiled.
+
+    At another level its bits are others.
+    """
+    on_cpu = name in LEVELS and jax.default_backend() == "cpu"
+    level = {"xla_backend_optimization_level": LEVELS[name]} if on_cpu else None
+    return jax.jit(function, compiler_options=level, **options)
+
+
 def start(name: str, traced: Any, seconds: dict[str, float]) -> Future[Any]:
     """Compiles a traced program in a thread of its own, and notes how many seconds it took."""
     begin, lowered = time.perf_counter(), traced.lower()
 
     def compile_it() -> Any:
-        compiled = lowered.compile(compiler_options=compiler_options(name))
+        compiled = lowered.compile()
         seconds[name] = time.perf_counter() - begin
         return compiled
 
@@ -145,13 +153,6 @@ def start(name: str, traced: Any, seconds: dict[str, float]) -> Future[Any]:
     future = pool.submit(compile_it)
     pool.shutdown(wait=False)
     return future
-
-
-def compiler_options(name: str) -> dict[str, int] | None:
-    """Returns XLA's options for a program of that name."""
-    if name not in LEVELS or jax.default_backend() != "cpu":
-        return None
-    return {"xla_backend_optimization_level": LEVELS[name]}
 
 
 def when_needed(

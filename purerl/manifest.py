@@ -5,6 +5,7 @@ start, compared on resuming, and its fingerprint stands in every checkpoint.
 """
 
 import ast
+import functools
 import hashlib
 import importlib.util
 import json
@@ -135,7 +136,7 @@ def source_hash(builders: Iterable[Callable]) -> str:
     does not keep a run from resuming.
     """
     names = ["purerl.ppo", "purerl.evaluation"]
-    names += [builder.__module__ for builder in builders if hasattr(builder, "__module__")]
+    names += [module_of(builder) for builder in builders]
     files = imported_files(names)
     folders = {file.parent.parent / "assets" for file in files.values()}
     bodies = {f"assets/{f.name}": f for folder in folders for f in folder.rglob("*.xml")}
@@ -144,6 +145,13 @@ def source_hash(builders: Iterable[Callable]) -> str:
     for name, file in sorted((files | bodies).items()):
         total.update(name.encode() + b"\0" + file.read_bytes())
     return total.hexdigest()[:16]
+
+
+def module_of(builder: Callable) -> str:
+    """Returns the module that a function, or what wraps it as a partial, comes from."""
+    while isinstance(builder, functools.partial):
+        builder = builder.func
+    return builder.__module__
 
 
 def imported_files(names: Iterable[str]) -> dict[str, Path]:

@@ -19,7 +19,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
 from purerl import ppo
-from purerl.compilation import Programs, compiler_options, shapes, start, unordered, when_needed
+from purerl.compilation import Programs, jit, shapes, start, unordered, when_needed
 from purerl.config import Config
 from purerl.env import Env
 from purerl.evaluation import evaluate_in_run
@@ -218,7 +218,7 @@ def compile_programs(
         functools.partial(judge_policy, config, env, network, evaluation.num_episodes, abstract)
     )
     here = shapes(learned, SingleDeviceSharding(device))
-    make: Any = jax.jit(init, compiler_options=compiler_options("init"))
+    make = jit("init", init)
     making = start("init", make.trace(key), seconds) if fresh else None
     if evaluation.number:
         judge = when_needed("evaluation", judge, here, seconds)

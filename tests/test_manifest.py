@@ -58,6 +58,7 @@ def test_an_edit_changes_the_source_hash(tmp_path, monkeypatch):
     import bodies_and_tasks.task as task
 
     before = manifest.source_hash([task.build])
+    assert manifest.source_hash([functools.partial(task.build)]) == before
     (package / "other.py").write_text("LEGS = 8\n")
     assert manifest.source_hash([task.build]) == before
     (package / "body.py").write_text("LEGS = 6\n")
