@@ -151,7 +151,17 @@ def _mistakes(file: str) -> Iterator[None]:
         frames = traceback.extract_tb(error.__traceback__)
         lines = [frame.lineno for frame in frames if frame.filename == file]
         where = f", line {lines[-1]}" if lines else ""
-        raise UserError(f"{file}{where}: {one_line(error)}") from error
+        raise UserError(f"{file}{where}: {one_line(error)}{_hint(file, error)}") from error
+
+
+def _hint(file: str, error: Exception) -> str:
+    """Returns what to do about a module that stands beside the file that imports it."""
+    beside = Path(file).parent
+    if isinstance(error, ModuleNotFoundError) and error.name:
+        place = beside / error.name.partition(".")[0]
+        if place.is_dir() or place.with_suffix(".py").exists():
+            return f"; it stands beside the file: set PYTHONPATH={beside}"
+    return ""
 
 
 def _from_module(name: str) -> Source:

@@ -13,6 +13,7 @@ import os
 import platform
 import subprocess
 import sys
+import sysconfig
 from collections.abc import Callable, Iterable
 from importlib import metadata
 from pathlib import Path
@@ -131,8 +132,8 @@ def differences(old: Any, new: Any, path: str = "") -> list[str]:
 def source_hash(builders: Iterable[Callable]) -> str:
     """Returns a short sha256 over the source that decides a run's bits.
 
-    That is: every Python file that the algorithm and the builders import from this package or
-    their own, and the bodies (`assets/*.xml`) beside. An edit of a plot or of another environment
+    That is: every Python file that the algorithm and the builders import, but for installed
+    packages, and the bodies (`assets/*.xml`) beside. An edit of a plot or of another environment
     does not keep a run from resuming.
     """
     names = ["purerl.ppo", "purerl.evaluation"]
@@ -155,19 +156,25 @@ def module_of(builder: Callable) -> str:
 
 
 def imported_files(names: Iterable[str]) -> dict[str, Path]:
-    """Returns module name -> file, of `names` and all they import from the same packages."""
+    """Returns module name -> file, of `names` and all they import.
+
+    Other packages' files count unless they are installed: those have a version.
+    """
     todo = list(names)
     packages = {name.partition(".")[0] for name in todo}
     found: dict[str, Path] = {}
     while todo:
         name = todo.pop()
-        if name in found or name.partition(".")[0] not in packages:
-            continue
-        file = module_file(name)
-        if file is not None:
+        file = None if name in found else module_file(name)
+        if file is not None and (name.partition(".")[0] in packages or not _is_installed(file)):
             found[name] = file
             todo += _imports(file)
     return found
+
+
+def _is_installed(file: Path) -> bool:
+    of_python = file.is_relative_to(sysconfig.get_path("stdlib"))
+    return of_python or not {"site-packages", "dist-packages"}.isdisjoint(file.parts)
 
 
 def module_file(name: str) -> Path | None:

@@ -53,6 +53,17 @@ def test_a_mistake_in_the_file_names_its_line(tmp_path):
             experiment.load(tmp_path / "bad.py")
 
 
+def test_a_module_beside_the_file_is_found_with_the_path_that_the_error_names(tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text("import my_rewards\n")
+    with pytest.raises(UserError) as error:
+        experiment.load(file)
+    assert "PYTHONPATH" not in str(error.value)
+    (tmp_path / "my_rewards.py").write_text("UPRIGHT = 1\n")
+    with pytest.raises(UserError, match=f"PYTHONPATH={tmp_path}$"):
+        experiment.load(file)
+
+
 def test_settings_survive_json():
     chosen = experiment.load(TOY).experiment
     network = dataclasses.replace(chosen.network, policy_hidden=(5, 6))
