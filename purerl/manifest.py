@@ -162,19 +162,24 @@ def imported_files(names: Iterable[str]) -> dict[str, Path]:
     """
     todo = list(names)
     packages = {name.partition(".")[0] for name in todo}
+    installed = installed_folders()
     found: dict[str, Path] = {}
     while todo:
         name = todo.pop()
         file = None if name in found else module_file(name)
-        if file is not None and (name.partition(".")[0] in packages or not _is_installed(file)):
+        if file is None or file.suffix != ".py":
+            continue
+        if name.partition(".")[0] in packages or installed.isdisjoint(file.parents):
             found[name] = file
             todo += _imports(file)
     return found
 
 
-def _is_installed(file: Path) -> bool:
-    of_python = file.is_relative_to(sysconfig.get_path("stdlib"))
-    return of_python or not {"site-packages", "dist-packages"}.isdisjoint(file.parts)
+def installed_folders() -> set[Path]:
+    """Returns where Python and installed packages are: beside a package there is its metadata."""
+    places = {Path(place).absolute() for place in sys.path}
+    installed = {place for place in places if any(place.glob("*.dist-info"))}
+    return installed | {Path(sysconfig.get_path("stdlib"))}
 
 
 def module_file(name: str) -> Path | None:
@@ -200,7 +205,7 @@ def module_file(name: str) -> Path | None:
 def _imports(file: Path) -> list[str]:
     """Returns every name that a file's import statements may mean as a module."""
     names: list[str] = []
-    for node in ast.walk(ast.parse(file.read_text())):
+    for node in ast.walk(ast.parse(file.read_bytes())):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:

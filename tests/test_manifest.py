@@ -50,11 +50,15 @@ def test_an_edit_changes_the_source_hash(tmp_path, monkeypatch):
     package.mkdir()
     (package / "__init__.py").write_text("")
     (package / "task.py").write_text(
-        "import json, my_rewards\nfrom bodies_and_tasks import body\n\ndef build():\n    pass\n"
+        "import simulator, my_rewards\nfrom bodies_and_tasks import body\n\ndef build(): ...\n"
     )
     (package / "body.py").write_text("LEGS = 4\n")
     (package / "other.py").write_text("LEGS = 4\n")
     (tmp_path / "my_rewards.py").write_text("UPRIGHT = 1\n")  # of no package, and not installed
+    installed = tmp_path / "anywhere"
+    (installed / "simulator-1.0.dist-info").mkdir(parents=True)
+    (installed / "simulator.py").write_text("import my_rewards\n")
+    monkeypatch.syspath_prepend(str(installed))
     monkeypatch.syspath_prepend(str(tmp_path))
     import bodies_and_tasks.task as task
 
@@ -64,6 +68,8 @@ def test_an_edit_changes_the_source_hash(tmp_path, monkeypatch):
     assert manifest.source_hash([task.build]) == before
     (tmp_path / "my_rewards.py").write_text("UPRIGHT = 2\n")
     assert (after := manifest.source_hash([task.build])) != before
+    (installed / "simulator.py").write_text("")
+    assert manifest.source_hash([task.build]) == after
     (package / "body.py").write_text("LEGS = 6\n")
     assert manifest.source_hash([task.build]) not in (before, after)
 
