@@ -98,6 +98,7 @@ def our_experiment(body: str, physics: str, sizes: Published, num_steps: int) ->
         num_envs=sizes.num_envs,
         # brax takes several unrolls of each environment in turn, to fill its minibatches.
         rollout_length=sizes.samples // sizes.num_envs,
+        segment_length=sizes.unroll_length,
         num_epochs=sizes.num_updates_per_batch,
         num_minibatches=sizes.num_minibatches,
         episode_length=EPISODE_LENGTH,

@@ -29,6 +29,10 @@ class Config:
     """Discount of one policy step."""
     gae_lambda: float = 0.95
     """Decay of the advantage trace, lambda."""
+    segment_length: int = 0
+    """Steps of the segments into which rollouts are cut, which minibatches hold whole, and whose
+    advantages and value targets each gradient step estimates anew, from the values of then (brax's
+    unroll_length); 0: estimated once an update, over whole rollouts."""
     clip: float = 0.2
     """Range of the policy ratio, 1 +- clip."""
     value_clip: float | None = None
@@ -67,11 +71,15 @@ class Config:
         for name in ("learning_rate", "clip", "max_gradient_norm", "desired_kl", "reward_scale"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be above 0.")
-        for name in ("value_clip", "value_weight", "entropy_weight"):
+        for name in ("value_clip", "value_weight", "entropy_weight", "segment_length"):
             value = getattr(self, name)
             if value is not None and not 0.0 <= value < math.inf:
                 raise ValueError(f"{name} is {value}; it must be 0 or above, and finite.")
         _check_budget(self)
+        if self.segment_length:
+            check_divides(
+                "rollout_length", self.rollout_length, "segment_length", self.segment_length
+            )
         check_pool(self)
 
     @property

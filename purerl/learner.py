@@ -17,15 +17,17 @@ from purerl import losses
 from purerl.config import Config
 from purerl.keys import Purpose, derive
 from purerl.rollout import select
-from purerl.shards import WHOLE, Shards, add_in_order, move, numbers, total
-from purerl.targets import Batch
+from purerl.shards import WHOLE, Shards, add_in_order, each, move, numbers, total
+from purerl.targets import Batch, in_segments, renew
 from purerl.types import Array, Metrics, Network, PolicyOutput, PyTree, TrainState
+
+PLACE = 64  # numbers: 128 bytes of any type
 
 
 class Learner(NamedTuple):
     """What a minibatch step changes."""
 
-    params: Array  # [P] all parameters
+    params: Array  # [P] all parameters (`in_one_vector`)
     optimizer: PyTree  # Adam's moments, [P] each
     learning_rate: Array  # []
     skipped_in_a_row: Array  # [] int32
@@ -41,6 +43,27 @@ def optimizer(config: Config) -> optax.GradientTransformation:
         optax.clip_by_global_norm(config.max_gradient_norm),
         optax.scale_by_adam(eps=1e-5),
     )
+
+
+def in_one_vector(params: PyTree) -> tuple[Array, Callable[[Array], PyTree]]:
+    """Returns parameters as one vector [P], and the function that makes a tree of such a vector.
+
+    Each parameter begins at a multiple of `PLACE` numbers, with zeros between. On a GPU, XLA hands
+    cuBLAS a part of a vector without copying it, and cuBLAS refuses one that begins anywhere
+    ("cublasLtMatmul: the requested functionality is not supported", jax 0.11.2).
+    """
+
+    def widen(leaf: Array) -> Array:
+        return jnp.pad(leaf.ravel(), (0, -leaf.size % PLACE))
+
+    vector, as_padded = ravel_pytree(jax.tree.map(widen, params))
+
+    def as_tree(vector: Array) -> PyTree:
+        return jax.tree.map(
+            lambda wide, leaf: wide[: leaf.size].reshape(leaf.shape), as_padded(vector), params
+        )
+
+    return vector, as_tree
 
 
 def is_recurrent(carry: PyTree) -> bool:
@@ -60,17 +83,26 @@ def learn(
 
     Each shard shuffles its own samples, and has an equal part in every minibatch.
     """
-    if not is_recurrent(memory):
+    if config.segment_length:
+        batch = move(shards, functools.partial(in_segments, config.segment_length), batch)
+    elif not is_recurrent(memory):
         # One long row of samples: a minibatch is any of them, [1, M].
         batch = move(shards, _in_one_row, batch)
     columns = batch.weight.shape[-1]
-    params, as_tree = ravel_pytree(state.params)
+    params, as_tree = in_one_vector(state.params)
     rate = scheduled_rate(config, state)
     learner = Learner(params, state.optimizer, rate, state.skipped_in_a_row)
     key = derive(state.key, Purpose.PERMUTATION, state.update)
 
     def step(learner: Learner, index: Array) -> tuple[Learner, Metrics]:
         minibatch, start = move(shards, _take, batch, memory, index)
+        if config.segment_length:
+            minibatch = each(
+                shards,
+                lambda *part: renew(config, network, as_tree(learner.params), *part),
+                minibatch,
+                start,
+            )
         return minibatch_step(config, network, as_tree, learner, minibatch, start, shards)
 
     def epoch(learner: Learner, number: Array) -> tuple[Learner, Metrics]:

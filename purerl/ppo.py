@@ -12,13 +12,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 
 from purerl import normalizer
 from purerl.config import Config, check_divides
 from purerl.env import Env
 from purerl.keys import Purpose, derive, per_environment
-from purerl.learner import is_recurrent, learn, optimizer
+from purerl.learner import in_one_vector, is_recurrent, learn, optimizer
 from purerl.rollout import Finished, Transition, rollout, start_episodes
 from purerl.shards import WHOLE, Shards, gather, total
 from purerl.starts import count_replays
@@ -48,8 +47,15 @@ class Experience(NamedTuple):
 def check_sizes(config: Config, carry: PyTree, number: int = 1) -> None:
     """Raises ValueError unless the minibatches divide the rollout of each of `number` shards."""
     size, name = config.num_envs // number, "num_envs / num_shards" if number > 1 else "num_envs"
+    if config.segment_length and is_recurrent(carry):
+        raise ValueError(
+            f"segment_length is {config.segment_length}, and the network is recurrent, so that its "
+            "minibatches hold whole rollouts; segment_length must be 0."
+        )
     if not is_recurrent(carry):
         size, name = size * config.rollout_length, f"{name} * rollout_length"
+    if config.segment_length:
+        size, name = size // config.segment_length, f"{name} / segment_length"
     check_divides(name, size, "num_minibatches", config.num_minibatches)
 
 
@@ -68,7 +74,7 @@ def init(config: Config, env: Env, network: Network, key: Array) -> TrainState:
     limit = jax.vmap(lambda k: jax.random.randint(k, (), 1, config.episode_length + 1))(limit_keys)
     return TrainState(
         params=params,
-        optimizer=optimizer(config).init(ravel_pytree(params)[0]),
+        optimizer=optimizer(config).init(in_one_vector(params)[0]),
         learning_rate=jnp.asarray(config.learning_rate, jnp.float32),
         normalizer=normalizer.init(jax.tree.map(lambda x: x[0], env_state.observation)),
         reward_normalizer=normalizer.init(jnp.zeros(())),

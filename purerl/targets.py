@@ -1,4 +1,4 @@
-"""What the losses read: advantages and value targets of a rollout, computed once an update."""
+"""What the losses read: advantages and value targets, of a rollout or of segments of it."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,18 @@ from purerl import normalizer
 from purerl.config import Config
 from purerl.gae import gae
 from purerl.rollout import Transition
-from purerl.types import Array, PyTree, TrainState
+from purerl.types import Array, Network, PyTree, TrainState
+
+
+class Course(NamedTuple):
+    """What happened in T steps, as advantages need it besides values, [T, B] each."""
+
+    reward: Array  # scaled
+    terminated: Array  # bool
+    done: Array  # bool
+    truncated: Array  # bool
+    truncation_value: Array  # of the observation before the reset
+    valid: Array  # bool
 
 
 class Batch(NamedTuple):
@@ -23,6 +34,8 @@ class Batch(NamedTuple):
     target: Array  # [...] of the value
     weight: Array  # [...] 0 where the physics blew up, else 1
     first: Array  # [...] bool: an episode begins here, so the memory starts from zero
+    course: Course | None = None  # [...] kept where segments are estimated anew
+    following: PyTree = None  # [S, B, O] observation that follows each segment, normalized
 
 
 def reward_factor(config: Config, state: TrainState) -> Array:
@@ -33,33 +46,72 @@ def reward_factor(config: Config, state: TrainState) -> Array:
     return config.reward_scale * jax.lax.rsqrt(variance + normalizer.VARIANCE_FLOOR)
 
 
-def next_values(transitions: Transition, last_value: Array) -> Array:
-    """Returns V(s'_t) [T, B]: the next row's value, or the one kept at a truncation."""
-    following = jnp.concatenate([transitions.value[1:], last_value[None]])
-    return jnp.where(transitions.truncated, transitions.truncation_value, following)
+def estimate(
+    config: Config, course: Course, value: Array, last_value: Array
+) -> tuple[Array, Array]:
+    """Returns advantages and value targets [T, B] of values [T, B] and what follows them, [B]."""
+    following = jnp.concatenate([value[1:], last_value[None]])
+    advantage = jax.vmap(gae, in_axes=(1, 1, 1, 1, 1, 1, None, None), out_axes=1)(
+        course.reward,
+        value,
+        jnp.where(course.truncated, course.truncation_value, following),
+        course.terminated,
+        course.done,
+        course.valid,
+        config.gamma,
+        config.gae_lambda,
+    )
+    return advantage, advantage + value
 
 
 def make_batch(
     config: Config, state: TrainState, transitions: Transition, last_value: Array, first: Array
 ) -> Batch:
-    """Computes advantages and value targets once, [T, B]; `first` [B] opens the rollout."""
-    advantage = jax.vmap(gae, in_axes=(1, 1, 1, 1, 1, 1, None, None), out_axes=1)(
-        transitions.reward * reward_factor(config, state),
-        transitions.value,
-        next_values(transitions, last_value),
-        transitions.terminated,
-        transitions.done,
-        transitions.valid,
-        config.gamma,
-        config.gae_lambda,
+    """Computes advantages and value targets of a rollout, [T, B].
+
+    `state` is the one after it, `last_value` [B] that of its observation, `first` [B] opens the
+    rollout.
+    """
+    course = Course(
+        reward=transitions.reward * reward_factor(config, state),
+        **{name: getattr(transitions, name) for name in Course._fields[1:]},
     )
-    return Batch(
+    advantage, target = estimate(config, course, transitions.value, last_value)
+    batch = Batch(
         observation=normalizer.normalize(state.normalizer, transitions.observation),
         raw_action=transitions.raw_action,
         log_prob=transitions.log_prob,
         old_value=transitions.value,
         advantage=advantage,
-        target=advantage + transitions.value,
+        target=target,
         weight=transitions.valid.astype(jnp.float32),
         first=jnp.concatenate([first[None], transitions.done[:-1]]),
     )
+    if not config.segment_length:
+        return batch
+    last = normalizer.normalize(state.normalizer, state.env.observation)
+    ends = slice(config.segment_length, None, config.segment_length)
+    following = jax.tree.map(
+        lambda x, end: jnp.concatenate([x[ends], end[None]]), batch.observation, last
+    )
+    return batch._replace(course=course, following=following)
+
+
+def in_segments(length: int, batch: Batch) -> Batch:
+    """Cuts a rollout [T, B] into segments of L steps side by side, [L, T / L * B]."""
+
+    def cut(x: Array) -> Array:
+        parts = x.reshape(-1, length, *x.shape[1:])
+        return jnp.swapaxes(parts, 0, 1).reshape(length, -1, *x.shape[2:])
+
+    following = jax.tree.map(lambda x: x.reshape(1, -1, *x.shape[2:]), batch.following)
+    return jax.tree.map(cut, batch._replace(following=None))._replace(following=following)
+
+
+def renew(config: Config, network: Network, params: PyTree, batch: Batch, memory: PyTree) -> Batch:
+    """Estimates segments [L, M] anew, from what `params` say of them and of what follows."""
+    seen = jax.tree.map(lambda *x: jnp.concatenate(x), batch.observation, batch.following)
+    values = network.apply(params, seen, memory)[0].value
+    assert batch.course is not None
+    advantage, target = estimate(config, batch.course, values[:-1], values[-1])
+    return batch._replace(advantage=advantage, target=target)

@@ -209,6 +209,61 @@ def test_truncation_bootstraps_from_the_observation_before_the_reset():
     assert first[0].all()
 
 
+@pytest.mark.parametrize("length", [4, 16])
+def test_segments_are_estimated_from_the_values_of_now(length):
+    """Each segment against the slow reference: it bootstraps where it ends, from new parameters."""
+    config = dataclasses.replace(CONFIG, segment_length=length)
+    env, network, state = setup(env=Walk(edge=1.5))
+    after, transitions, _, last_value = ROLLOUT(config, env, network, state)
+    batch = targets.make_batch(config, after, transitions, last_value, state.episode.length == 0)
+    params = jax.tree.map(lambda x: 1.5 * x + 0.1, state.params)
+    renewed = targets.renew(config, network, params, targets.in_segments(length, batch), ())
+
+    def value_of(features):
+        return np.asarray(network.apply(params, features, ())[0].value)
+
+    moved = transitions.observation[..., 0] + np.tanh(transitions.raw_action[..., 0])
+    last = value_of(normalizer.normalize(state.normalizer, after.env.observation))
+    values = value_of(batch.observation)
+    following = np.concatenate([values[1:], last[None]])
+    now = jax.tree.map(np.asarray, transitions._replace(value=values))
+
+    def kept_value(observation):  # at a truncation: that of the policy that acted
+        features = normalizer.normalize(state.normalizer, jnp.asarray(observation))
+        return float(network.apply(state.params, features, ())[0].value)
+
+    for i in range(0, 16, length):
+        part = jax.tree.map(lambda x, i=i: x[i : i + length], now)
+        before_reset = np.stack([moved, moved**2], -1)[i : i + length]
+        end = following[i + length - 1]
+        expected = slow_batch(part, end, before_reset, kept_value, 0.9, config.gae_lambda)
+        columns = slice(i // length * 6, (i // length + 1) * 6)
+        found = renewed.advantage[:, columns], renewed.target[:, columns]
+        np.testing.assert_allclose(found[0], expected, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(found[1], expected + part.value, rtol=1e-4, atol=1e-5)
+
+
+def test_segments_stay_whole_and_are_renewed_before_each_gradient_step(monkeypatch):
+    config = dataclasses.replace(CONFIG, segment_length=4)
+    env, network, state = setup()
+    seen = []
+
+    def spy(config, network, params, batch, memory):
+        jax.debug.callback(lambda *x: seen.append(x), params, batch.course.reward)
+        return targets.renew(config, network, params, batch, memory)
+
+    monkeypatch.setattr(learner, "renew", spy)
+    jax.block_until_ready(jax.jit(partial(ppo.update, config, env, network))(state))
+    jax.effects_barrier()
+    assert len(seen) == config.num_epochs * config.num_minibatches
+    firsts = {np.asarray(jax.tree.leaves(params)[0]).tobytes() for params, _ in seen}
+    assert len(firsts) == len(seen)
+    _, transitions, _, _ = ROLLOUT(CONFIG, env, network, state)
+    whole = np.asarray(transitions.reward).reshape(4, 4, 6).swapaxes(0, 1).reshape(4, -1)
+    epoch = np.concatenate([reward for _, reward in seen[: config.num_minibatches]], axis=1)
+    assert {column.tobytes() for column in epoch.T} == {column.tobytes() for column in whole.T}
+
+
 def test_recurrent_memory_restarts_with_each_episode_in_rollout_and_learner():
     """The learner's unroll, from the stored memory, gives the rollout's values bit for bit."""
     env, network, state = setup(recurrent=True)
@@ -465,6 +520,8 @@ def test_update_keeps_rank_promotion_strict():
         ({"gamma": 1.5}, ("gamma is 1.5", "[0, 1]")),
         ({"num_envs": 0}, ("num_envs is 0", "at least 1")),
         ({"clip": 0.0}, ("clip is 0.0", "above 0")),
+        ({"segment_length": -4}, ("segment_length is -4", "0 or above")),
+        ({"segment_length": 5}, ("segment_length = 5", "rollout_length = 16", "4")),
     ],
 )
 def test_impossible_settings_are_refused(changes, words):
@@ -487,3 +544,24 @@ def test_sizes_that_do_not_divide(recurrent, minibatches, words):
         setup(config, recurrent=recurrent)
     for word in words:
         assert word in str(error.value)
+
+
+def test_segments_count_in_minibatches_and_are_not_for_recurrent_networks():
+    config = dataclasses.replace(CONFIG, segment_length=8, num_minibatches=16)
+    with pytest.raises(ValueError, match="num_envs \\* rollout_length / segment_length = 12"):
+        setup(config)
+    with pytest.raises(ValueError, match="segment_length is 8, and the network is recurrent"):
+        setup(config, recurrent=True)
+
+
+def test_parameters_in_one_vector_begin_where_a_gpu_can_read_them():
+    shapes = {"a": (1,), "b": (3, 27), "c": (), "d": (64,), "e": (5, 1)}
+    params = {k: jnp.full(s, i + 1.0) for i, (k, s) in enumerate(shapes.items())}
+    params["b"] = params["b"].astype(jnp.bfloat16)
+    vector, as_tree = learner.in_one_vector(params)
+    starts = [int(np.argmax(np.asarray(vector) == i + 1.0)) for i in range(len(shapes))]
+    assert starts == [0, 64, 192, 256, 320]  # multiples of 128 bytes, whatever the type
+    assert (np.asarray(vector) != 0).sum() == sum(x.size for x in params.values())
+    for old, new in zip(*map(jax.tree.leaves, (params, as_tree(vector))), strict=True):
+        assert old.dtype == new.dtype
+        np.testing.assert_array_equal(old, new)
