@@ -110,9 +110,14 @@ def test_a_run_goes_on_with_another_number_of_devices(toy, tmp_path):
     assert lines(folder) == lines(toy)
 
 
-def test_by_default_every_device_has_a_shard(tmp_path):
-    said = start(tmp_path, 2, str(TOY), "--name", "default")
-    explicit = start(tmp_path, 1, str(TOY), "--num-shards", "2", "--name", "explicit")
+# Sums over 128 samples a shard, which XLA computed otherwise where a device had one shard.
+LARGER = ["--ppo.num-envs", "64", "--ppo.rollout-length", "8", "--ppo.num-steps", "2048"]
+
+
+@pytest.mark.parametrize("words", [LARGER, ["--ppo.segment-length", "2"]])
+def test_by_default_every_device_has_a_shard(tmp_path, words):
+    said = start(tmp_path, 2, str(TOY), *words, "--name", "default")
+    explicit = start(tmp_path, 1, str(TOY), *words, "--num-shards", "2", "--name", "explicit")
     assert digest(said) == digest(explicit)
     facts = json.loads((tmp_path / "toy_experiment" / "default" / "manifest.json").read_text())
     assert facts["num_shards"] == facts["devices"] == 2
