@@ -13,8 +13,8 @@ samples, minibatches and epochs; no evaluation and no checkpoint. Three lines of
 
 A line's physics alone is that physics under random actions, from the same starts, without
 observation, reward or network; brax's is that of the second line. What differs by design is what
-each trainer does besides: brax takes advantages anew in every minibatch, over short unrolls; ours
-draws a fresh start for each episode, and takes MJX's matrix products in whole float32.
+each trainer does besides: ours draws a fresh start for each episode, takes MJX's matrix products in
+whole float32, and leaves no lambda out of the advantage.
 
 Whole training and its returns: `experiments/brax_training.py`.
 """
@@ -33,9 +33,10 @@ import jax
 import jax.numpy as jnp
 
 from envs import brax_env
+from experiments import brax_network
 from experiments.benchmark import Part, measure
 from experiments.peers import Ours
-from purerl import compilation, kernels, networks, rundir
+from purerl import compilation, kernels, rundir
 from purerl.config import Config
 from purerl.errors import leave
 from purerl.experiment import Evaluation, Experiment
@@ -110,8 +111,8 @@ def our_experiment(body: str, physics: str, sizes: Published, num_steps: int) ->
         reward_scale=sizes.reward_scaling,
     )
     options: Any = brax_env.Options(name=body, backend=physics)  # type: ignore[arg-type]
-    network = networks.MlpOptions(policy_hidden=sizes.policy, value_hidden=sizes.value, std="state")
-    return Experiment(brax_env.build, options, networks.mlp, network, config, engine="jax")
+    network = brax_network.Options(policy_hidden=sizes.policy, value_hidden=sizes.value)
+    return Experiment(brax_env.build, options, brax_network.build, network, config, engine="jax")
 
 
 def physics_alone(env: Any, num_steps: int, start: PyTree, key: Array) -> Array:

@@ -131,6 +131,7 @@ def test_braxs_settings_make_the_same_update(body):
     assert sizes.batch_size * sizes.num_minibatches % sizes.num_envs == 0  # brax's own rule
     minibatch = config.samples_per_update // config.num_minibatches
     assert minibatch == sizes.batch_size * sizes.unroll_length
+    assert config.segment_length == sizes.unroll_length
 
 
 @pytest.mark.parametrize("body", ["ant", "humanoid"])
@@ -176,3 +177,36 @@ def test_the_difference_of_returns_has_an_interval_from_five_seeds_on():
     ours, theirs = np.arange(5.0) + 100, np.arange(5.0)
     assert brax_training.difference(ours, theirs).startswith("100 [")
     assert brax_training.difference(ours[:4], theirs) == "100, too few seeds"
+
+
+def test_braxs_network_is_braxs():
+    """The same parameters give the same policy and value, and begin alike."""
+    pytest.importorskip("brax", reason="needs the extra peers")
+    from brax.training.agents.ppo import networks as brax_networks
+
+    from experiments import brax_network
+
+    theirs = brax_networks.make_ppo_networks(
+        27, 8, policy_hidden_layer_sizes=(32,) * 4, value_hidden_layer_sizes=(256,) * 5
+    )
+    keys = jax.random.split(jax.random.key(0), 2)
+    policy, value = theirs.policy_network.init(keys[0]), theirs.value_network.init(keys[1])
+    ours = brax_network.build(brax_network.Options(), jnp.zeros(27), 8)
+    begun, carry = ours.init(jax.random.key(1))
+    params = {"params": {"policy": policy["params"], "value": value["params"]}}
+    for name, own, other in zip(
+        map(str, jax.tree.leaves_with_path(begun)),
+        jax.tree.leaves(begun),
+        jax.tree.leaves(params),
+        strict=True,
+    ):
+        assert own.shape == other.shape, name
+        np.testing.assert_allclose(own.std(), other.std(), rtol=0.2, err_msg=name)
+    observation = jax.random.normal(jax.random.key(2), (5, 27))
+    output, _ = ours.apply(params, observation, carry)
+    logits = theirs.policy_network.apply(None, policy, observation)
+    expected = theirs.parametric_action_distribution.create_dist(logits)
+    np.testing.assert_allclose(output.distribution.loc, expected.loc, atol=1e-5)
+    np.testing.assert_allclose(output.distribution.scale, expected.scale, atol=1e-5)
+    theirs_value = theirs.value_network.apply(None, value, observation)
+    np.testing.assert_allclose(output.value, theirs_value, atol=1e-4)
