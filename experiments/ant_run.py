@@ -2,7 +2,7 @@
 
 python -m purerl.run ant_run
 
-Expected: 4.6 m/s after 3.6 min, on two CPU cores (seeds 2 and 3: 4.4 and 4.1 m/s).
+Expected: 4.5 m/s after 3.6 min, on two CPU cores (seeds 2 and 3: 4.5 and 4.6 m/s).
 """
 
 from envs import run

@@ -32,7 +32,7 @@ import jax.numpy as jnp
 from experiments import start_up
 from purerl import cli, kernels, learner, ppo, run, rundir
 from purerl.console import size
-from purerl.errors import leave
+from purerl.errors import leave, output_file
 from purerl.evaluation import evaluate
 from purerl.experiment import Experiment, find
 from purerl.model import scale_action
@@ -226,7 +226,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("experiment", help="as for python -m purerl.run, with its overrides")
     parser.add_argument("--rounds", type=int, default=5, help="rounds of the measurement")
     parser.add_argument("--least-s", type=float, default=1.0, help="least time of a part [s]")
-    parser.add_argument("--json", default="", help="also write the figures to this file")
+    parser.add_argument(
+        "--json", type=output_file, default="", help="also write the figures to this file"
+    )
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="only these")
     parser.add_argument("--start-up", action="store_true", help="time a cold and a warm start")
     options, overrides = parser.parse_known_args(arguments)

@@ -38,7 +38,7 @@ from experiments.benchmark import Part, measure
 from experiments.peers import Ours
 from purerl import compilation, kernels, rundir
 from purerl.config import Config
-from purerl.errors import leave
+from purerl.errors import leave, output_file
 from purerl.experiment import Evaluation, Experiment
 from purerl.types import Array, PyTree
 
@@ -262,7 +262,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--stretches", type=int, default=5, help="of brax's; two of them compile")
     parser.add_argument("--rounds", type=int, default=10, help="updates timed of ours")
     parser.add_argument("--num-envs", type=int, default=0, help="0: as published; less for a try")
-    parser.add_argument("--json", default="", help="also write the figures to this file")
+    parser.add_argument(
+        "--json", type=output_file, default="", help="also write the figures to this file"
+    )
     options = parser.parse_args(arguments)
     if options.stretches < 3:
         parser.error(f"--stretches is {options.stretches}; two compile, so it takes at least 3.")

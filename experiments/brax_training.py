@@ -31,7 +31,7 @@ import numpy as np
 from experiments.brax_peer import BODIES, Published, our_experiment, resize, train_brax
 from purerl import compilation, kernels, rundir, statistics
 from purerl.compilation import Programs
-from purerl.errors import leave
+from purerl.errors import UserError, leave, output_file
 from purerl.experiment import Evaluation
 
 NUM_EPISODES = 128
@@ -199,6 +199,11 @@ def difference(values: np.ndarray, others: np.ndarray) -> str:
 
 def read(paths: list[str]) -> list[Run]:
     """Reads the runs of several files."""
+    missing = [path for path in paths if not Path(path).is_file()]
+    if missing:
+        raise UserError(
+            f"There is no file {', '.join(missing)}; `--json` of a training writes one."
+        )
     return [Run(**run) for path in paths for run in json.loads(Path(path).read_text())["runs"]]
 
 
@@ -218,7 +223,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
         add("--time-limit", type=float, default=float("inf"), help="begin no run after it [s]")
         add("--num-envs", type=int, default=0, help="0: as published; less for a try")
         add("--cache", default="", help="compilation cache's folder; of its own unless given")
-        add("--json", default="", help="also write the runs to this file")
+        add("--json", type=output_file, default="", help="also write the runs to this file")
     return parser.parse_args(arguments)
 
 

@@ -32,7 +32,7 @@ from experiments.benchmark import Part, Timing, measure
 from experiments.gymnasium_ant import experiment
 from purerl import ppo, rundir
 from purerl.config import Config
-from purerl.errors import leave
+from purerl.errors import leave, output_file
 from purerl.networks import MlpOptions
 
 
@@ -174,7 +174,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--rounds", type=int, default=3, help="rounds of the measurement")
     parser.add_argument("--least-s", type=float, default=3.0, help="least time of a round [s]")
     parser.add_argument("--torch-threads", type=int, default=1, help="threads of PyTorch")
-    parser.add_argument("--json", default="", help="also write the figures to this file")
+    parser.add_argument(
+        "--json", type=output_file, default="", help="also write the figures to this file"
+    )
     options = parser.parse_args(arguments)
     found = {}
     for setting in options.settings:

@@ -25,7 +25,7 @@ import jax
 
 from experiments.benchmark import compile_part, measure
 from purerl import ppo, rundir
-from purerl.errors import leave
+from purerl.errors import UserError, leave, output_file
 from purerl.experiment import Experiment, find
 
 AXES: dict[str, tuple[int, ...]] = {
@@ -64,7 +64,8 @@ def point(experiment: Experiment, name: str, engine: str, axis: str, value: int)
         command += ["--rounds", "2", "--least-s", "0.5", "--json", str(file)]
         command += ["--parts", "physics alone", "update"]
         command += overrides(axis, value, experiment.ppo)
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        if subprocess.run(command, stdout=subprocess.DEVNULL).returncode:  # it has told why
+            raise UserError(f"Measuring {axis} {value} failed; see above.")
         found = json.loads(file.read_text())
     physics, update = found["parts"]
     held = found["memory"]
@@ -121,7 +122,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--experiment", default="ant_run")
     parser.add_argument("--seeds-experiment", default="cartpole_swingup", help="for the axis seeds")
     parser.add_argument("--engine", default="auto")
-    parser.add_argument("--csv", default="", help="also write the points to this file")
+    parser.add_argument(
+        "--csv", type=output_file, default="", help="also write the points to this file"
+    )
     options = parser.parse_args(arguments)
     seeds = find(options.seeds_experiment).experiment
     experiment = find(options.experiment).experiment

@@ -17,6 +17,8 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
+from purerl.errors import UserError, leave
+
 LIMIT_S = 900.0
 
 
@@ -73,7 +75,8 @@ def watch(process: subprocess.Popen, folder: Path, begin: float) -> Start:
         }
         seen = {name: now for name, done in written.items() if done} | seen
         if process.poll() is not None or now > LIMIT_S:
-            raise RuntimeError(f"The run ended, or took {LIMIT_S:.0f} s, before its update: {text}")
+            last = " ".join(text.split("\n")[-2:]).strip()
+            raise UserError(f"The run ended, or took {LIMIT_S:.0f} s, before its update: {last}")
     times = seen["plan"], seen["compiled"], seen["update"], cpu_seconds(process.pid)
     return Start("", "", "", *times, compile_times(text))
 
@@ -142,4 +145,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    leave(lambda: main(sys.argv[1:]))

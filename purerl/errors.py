@@ -1,10 +1,12 @@
 """Errors that a person can act on: one line, no traceback, and an exit code."""
 
+import argparse
 import difflib
 import os
 import signal
 import sys
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import NoReturn
 
 SUCCESS = 0
@@ -38,6 +40,20 @@ def unknown(kind: str, name: str, valid: Iterable[str], where: str = "") -> User
     hint = f" Did you mean {near[0]}?" if near else ""
     listed = ", ".join(valid) if valid else "none"
     return UserError(f"There is no {kind} {name!r}{where}.{hint} Valid: {listed}.")
+
+
+def output_file(name: str) -> str:
+    """Returns the name of a file to write, "" for none; the `type` of an argument of argparse.
+
+    Raises:
+      argparse.ArgumentTypeError: it cannot be written, which is better known before measuring.
+    """
+    folder = Path(name).absolute().parent
+    if name and not os.access(folder, os.W_OK):
+        raise argparse.ArgumentTypeError(
+            f"{name} cannot be written: is {folder} a folder of yours?"
+        )
+    return name
 
 
 def one_line(error: BaseException) -> str:

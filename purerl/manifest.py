@@ -161,25 +161,44 @@ def imported_files(names: Iterable[str]) -> dict[str, Path]:
     Other packages' files count unless they are installed: those have a version.
     """
     todo = list(names)
-    packages = {name.partition(".")[0] for name in todo}
+    ours = {name.partition(".")[0]: True for name in todo}
     installed = installed_folders()
     found: dict[str, Path] = {}
     while todo:
         name = todo.pop()
-        file = None if name in found else module_file(name)
-        if file is None or file.suffix != ".py":
-            continue
-        if name.partition(".")[0] in packages or installed.isdisjoint(file.parents):
+        package = name.partition(".")[0]
+        if package not in ours:
+            ours[package] = not _is_within(package, installed)
+        file = module_file(name) if ours[package] and name not in found else None
+        if file is not None and file.suffix == ".py":
             found[name] = file
             todo += _imports(file)
     return found
 
 
+def _is_within(package: str, folders: set[Path]) -> bool:
+    """Tells whether a package is in one of the folders, or nowhere."""
+    file = module_file(package)
+    if file is not None:
+        return not folders.isdisjoint(file.parents)
+    spec = importlib.util.find_spec(package) if package != "__main__" else None
+    places = (spec and spec.submodule_search_locations) or []  # of a package without __init__.py
+    return all(not folders.isdisjoint(Path(place).absolute().parents) for place in places)
+
+
 def installed_folders() -> set[Path]:
     """Returns where Python and installed packages are: beside a package there is its metadata."""
     places = {Path(place).absolute() for place in sys.path}
-    installed = {place for place in places if any(place.glob("*.dist-info"))}
-    return installed | {Path(sysconfig.get_path("stdlib"))}
+    return {*filter(_holds_packages, places), Path(sysconfig.get_path("stdlib"))}
+
+
+def _holds_packages(folder: Path) -> bool:
+    try:
+        return any(name.endswith(".dist-info") for name in os.listdir(folder))
+    except PermissionError:  # whatever is in it, it cannot be this process's own source
+        return True
+    except OSError:  # an archive, or nothing
+        return False
 
 
 def module_file(name: str) -> Path | None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from experiments import benchmark, scaling, start_up
+from purerl.errors import UserError
 from purerl.experiment import find
 
 
@@ -101,7 +102,7 @@ def test_a_start_is_watched_to_its_first_update(tmp_path):
 
 
 def test_a_run_that_ends_before_its_update_is_an_error(tmp_path):
-    with pytest.raises(RuntimeError, match="must be at least 1"):
+    with pytest.raises(UserError, match="must be at least 1"):
         start_up.start("tests/toy_experiment.py", "c", ["--ppo.num-envs", "0"], tmp_path, "cold")
 
 
@@ -148,3 +149,10 @@ def test_measuring_one_axis_again_keeps_the_others(tmp_path):
     scaling.write(path, [{"axis": "seeds", "value": 2}])
     rows = [(row["axis"], row["value"]) for row in csv.DictReader(path.open())]
     assert rows == [("envs", "64"), ("seeds", "2")]
+
+
+def test_a_file_that_cannot_be_written_is_told_before_measuring(tmp_path, capsys):
+    for main, words in [(benchmark.main, ["ant_run", "--json"]), (scaling.main, ["--csv"])]:
+        with pytest.raises(SystemExit):
+            main([*words, str(tmp_path / "none" / "found.json")])
+        assert "cannot be written" in capsys.readouterr().err
