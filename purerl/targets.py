@@ -109,7 +109,10 @@ def in_segments(length: int, batch: Batch) -> Batch:
 
 
 def renew(config: Config, network: Network, params: PyTree, batch: Batch, memory: PyTree) -> Batch:
-    """Estimates segments [L, M] anew, from what `params` say of them and of what follows."""
+    """Estimates segments [L, M] anew, from what `params` say of them and of what follows.
+
+    The values of truncated episodes' last observations stay those of the rollout.
+    """
     seen = jax.tree.map(lambda *x: jnp.concatenate(x), batch.observation, batch.following)
     values = network.apply(params, seen, memory)[0].value
     assert batch.course is not None
