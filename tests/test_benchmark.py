@@ -136,11 +136,16 @@ def test_a_point_reads_the_benchmark_it_started(monkeypatch):
         assert command[0] == sys.executable
         with open(command[command.index("--json") + 1], "w") as file:
             json.dump(found, file)
+        return SimpleNamespace(returncode=ended)
 
+    ended = 0
     monkeypatch.setattr(scaling.subprocess, "run", run)
     row = scaling.point(find("ant_run").experiment, "ant_run", "c", "envs", 64)
     assert (row["steps_per_s"], row["physics_steps_per_s"], row["share"]) == (150, 200, 0.75)
     assert (row["state_mb"], row["update_mb"], row["process_mb"]) == (2.0, 5.0, 900)
+    ended = 2
+    with pytest.raises(UserError, match="envs 64 failed"):
+        scaling.point(find("ant_run").experiment, "ant_run", "c", "envs", 64)
 
 
 def test_measuring_one_axis_again_keeps_the_others(tmp_path):
