@@ -2,9 +2,9 @@
 
 python -m purerl.run rodent_run
 
-Expected: 1.5 m/s over whole 10 s episodes, head first, after 26 min on two CPU cores with other
-trainings beside it; 1.2 m/s after 1.6 M steps, 3 min on 14 cores. With MJX-Warp (`docs/gpu.md` has
-the command) 2.4 m/s after 21 M steps, 7 min of an H200 that trains another beside it.
+Expected: 1.7 m/s over 10 s episodes, head first, after 11 min on two CPU cores. With MJX-Warp
+(`docs/gpu.md` has the command) 2.4 m/s after 21 M steps, 7 min of an H200 that trains another
+beside it.
 """
 
 from envs import run
