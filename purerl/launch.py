@@ -65,12 +65,7 @@ def execute(
     shards = choose_shards(setup.config, abstract, options, begun_with)
     plan = train.make_plan(setup.config, chosen.evaluation, options.checkpoints, options.log_every)
     schedule = {"log_every": plan.log_every, "checkpoints": options.checkpoints}
-    platform = jax.default_backend()
-    chosen_by = kernels.how_chosen(platform)
-    builders = (chosen.build_env, chosen.build_network)
-    facts = manifest.collect(setup.engine, builders, chosen_by, shards.number)
-    if vmapped > 1:  # part of what the bits depend on
-        facts["vmapped_seeds"] = {"first": chosen.seed, "number": vmapped}
+    facts = describe_process(chosen, setup.engine, shards, vmapped)
 
     def prepare() -> bool:
         for folder in runs:
@@ -89,8 +84,8 @@ def execute(
     @functools.cache
     def programs() -> compilation.Programs:
         made = compile_programs(setup, chosen.evaluation, fresh, vmapped, shards)
-        if platform == "gpu" and distributed.is_first():
-            reasons = manifest.inexact_because(setup.engine, chosen_by, made.unordered)
+        if jax.default_backend() == "gpu" and distributed.is_first():
+            reasons = manifest.inexact_because(setup.engine, facts["kernels"], made.unordered)
             for folder in runs:
                 rundir.amend(folder, manifest.exactness(reasons))
             for place in made.unordered:
@@ -107,6 +102,18 @@ def execute(
             failed.append(str(error))
     if failed:
         raise RunError(" ".join(failed))
+
+
+def describe_process(
+    chosen: Experiment, engine: str, shards: Shards, vmapped: int
+) -> dict[str, Any]:
+    """Returns what the bits depend on besides the settings, as the manifest keeps it."""
+    builders = (chosen.build_env, chosen.build_network)
+    chosen_by = kernels.how_chosen(jax.default_backend())
+    facts = manifest.collect(engine, builders, chosen_by, shards.number)
+    if vmapped > 1:
+        facts["vmapped_seeds"] = {"first": chosen.seed, "number": vmapped}
+    return facts
 
 
 def compile_programs(

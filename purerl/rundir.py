@@ -191,7 +191,8 @@ def restore(folder: Path, update: str, say: Say, engine: str = "") -> Run:
 def code_changed(folder: Path, source: Source) -> bool:
     """Tells whether the code that the run's own file calls has been edited since the run began."""
     builders = (source.experiment.build_env, source.experiment.build_network)
-    if any(manifest.module_file(builder.__module__) == source.path for builder in builders):
+    modules = [manifest.module_of(builder) for builder in builders]
+    if any(manifest.module_file(module) == source.path for module in modules):
         return False  # it is its own copy of that code
     return manifest.source_hash(builders) != read_json(folder / "manifest.json").get("source")
 

@@ -55,11 +55,11 @@ def test_a_mistake_in_the_file_names_its_line(tmp_path):
 
 def test_a_module_beside_the_file_is_found_with_the_path_that_the_error_names(tmp_path):
     file = tmp_path / "mine.py"
-    file.write_text("import my_rewards\n")
+    file.write_text("import rewards_beside\n")
     with pytest.raises(UserError) as error:
         experiment.load(file)
     assert "PYTHONPATH" not in str(error.value)
-    (tmp_path / "my_rewards.py").write_text("UPRIGHT = 1\n")
+    (tmp_path / "rewards_beside.py").write_text("UPRIGHT = 1\n")
     with pytest.raises(UserError, match=f"PYTHONPATH={tmp_path}$"):
         experiment.load(file)
 
