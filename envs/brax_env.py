@@ -16,6 +16,7 @@ import mujoco
 from flax import struct
 
 from purerl.env import State
+from purerl.folding import on_cpu
 from purerl.physics import Physics, PhysicsState
 from purerl.types import Array, PyTree
 
@@ -150,7 +151,8 @@ def build(options: Options = Options(), engine: str = "auto") -> BraxEnv:  # noq
     from brax import envs
 
     ours = options.backend == "purerl"
-    env = envs.get_environment(options.name, backend="mjx" if ours else options.backend)
+    with on_cpu():
+        env = envs.get_environment(options.name, backend="mjx" if ours else options.backend)
     if ours:
         put_on_our_physics(env, engine)
     return BraxEnv(env, envs.State, int(env.action_size), float(env.dt))

@@ -4,6 +4,7 @@ MJX computes its indices from constants with JAX operations, tens of thousands o
 model. Here they are computed once, with numpy: JAX would compile a small program for each shape.
 """
 
+import contextlib
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -68,6 +69,14 @@ def _is_integral(dtype: Any) -> bool:
     return jnp.issubdtype(dtype, jnp.integer) or dtype == jnp.bool_
 
 
+def on_cpu() -> contextlib.AbstractContextManager:
+    """Computes on the CPU what is computed at once: a GPU's compiler takes its time over each."""
+    try:
+        return jax.default_device(jax.local_devices(backend="cpu")[0])
+    except RuntimeError:  # JAX_PLATFORMS leaves the CPU out
+        return contextlib.nullcontext()
+
+
 def _compute(eqn: core.JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
     """Computes one equation of known inputs."""
     rule = _RULES.get(eqn.primitive.name)
@@ -76,7 +85,7 @@ def _compute(eqn: core.JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
     elif rule and all(_is_integral(v.dtype) for v in values):
         outputs = [rule(eqn.params, *values)]
     else:
-        with jax.ensure_compile_time_eval():
+        with jax.ensure_compile_time_eval(), on_cpu():
             outputs = bind_equation(eqn, [jnp.asarray(v) for v in values])
     return [np.asarray(x, v.aval.dtype) for x, v in zip(outputs, eqn.outvars, strict=True)]
 

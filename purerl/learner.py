@@ -96,13 +96,6 @@ def learn(
 
     def step(learner: Learner, index: Array) -> tuple[Learner, Metrics]:
         minibatch, start = move(shards, _take, batch, memory, index)
-        if config.segment_length:
-            minibatch = each(
-                shards,
-                lambda *part: renew(config, network, as_tree(learner.params), *part),
-                minibatch,
-                start,
-            )
         return minibatch_step(config, network, as_tree, learner, minibatch, start, shards)
 
     def epoch(learner: Learner, number: Array) -> tuple[Learner, Metrics]:
@@ -225,6 +218,12 @@ def minibatch_step(
 
     `as_tree` makes the network's parameters of the learner's vector.
     """
+    rows, columns = batch.weight.shape[-2:]  # of one shard
+    number = count_slices(rows, columns, jax.default_backend())
+    batch, memory = move(shards, functools.partial(cut_in_slices, number), batch, memory)
+    if config.segment_length:
+        anew = functools.partial(renew, config, network, as_tree(learner.params))
+        batch = each(shards, functools.partial(of_slices, number, anew, 1), batch, memory)
     scale = losses.advantage_scale(batch.advantage, batch.weight, shards)
 
     def gradient(batch: Batch, memory: PyTree) -> tuple[tuple[Array, Metrics], PyTree]:
@@ -233,10 +232,8 @@ def minibatch_step(
 
         return jax.value_and_grad(objective, has_aux=True)(learner.params)
 
-    rows, columns = batch.weight.shape[-2:]  # of one shard
-    number = count_slices(rows, columns, jax.default_backend())
-    part = functools.partial(in_slices, gradient, number)
-    (objective, metrics), gradients = total(shards, part, batch, memory)
+    add = functools.partial(sum_of_slices, number, gradient)
+    (objective, metrics), gradients = total(shards, add, batch, memory)
     norm = optax.tree.norm(gradients)
     sound = jnp.isfinite(objective) & jnp.isfinite(norm)
     updates, optimizer_state = optimizer(config).update(gradients, learner.optimizer)
@@ -269,17 +266,32 @@ def count_slices(rows: int, columns: int, platform: str) -> int:
     return fit[0] if fit else 1
 
 
-def in_slices(function: Callable, number: int, batch: Batch, memory: PyTree) -> PyTree:
-    """Returns the sum of `function` of slices of a minibatch [T', M'], computed side by side."""
-    if number == 1:
-        return function(batch, memory)
+def cut_in_slices(number: int, batch: Batch, memory: PyTree) -> tuple[Batch, PyTree]:
+    """Cuts a minibatch [T', M'] and its memory [M'] into N slices, [T', N, M' / N] and [N, M' / N].
+
+    One slice is the minibatch as it is.
+    """
 
     def cut(x: Array, axis: int) -> Array:
         return x.reshape(*x.shape[:axis], number, -1, *x.shape[axis + 1 :])
 
-    batch = jax.tree.map(lambda x: cut(x, 1), batch)
-    memory = jax.tree.map(lambda x: cut(x, 0), memory)
-    return jax.tree.map(add_in_order, jax.vmap(function, (1, 0))(batch, memory))
+    if number == 1:
+        return batch, memory
+    return jax.tree.map(lambda x: cut(x, 1), batch), jax.tree.map(lambda x: cut(x, 0), memory)
+
+
+def of_slices(
+    number: int, function: Callable, out_axis: int, batch: Batch, memory: PyTree
+) -> PyTree:
+    """Returns `function` of every slice, computed side by side, [N] of them at `out_axis`."""
+    of_all = function if number == 1 else jax.vmap(function, (1, 0), out_axis)
+    return of_all(batch, memory)
+
+
+def sum_of_slices(number: int, function: Callable, batch: Batch, memory: PyTree) -> PyTree:
+    """Returns the sum of `function` of every slice."""
+    parts = of_slices(number, function, 0, batch, memory)
+    return parts if number == 1 else jax.tree.map(add_in_order, parts)
 
 
 def next_rate(config: Config, rate: Array, kl: Array, sound: Array) -> Array:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from purerl.shards import WHOLE, Shards, total
+from purerl.shards import WHOLE, Shards, add_in_order, from_all
 from purerl.types import Array
 
 
@@ -19,29 +19,33 @@ class Scale(NamedTuple):
     std: Array  # []
 
 
-def weighted_mean(x: Array, weight: Array, shards: Shards = WHOLE) -> Array:
+def weighted_mean(x: Array, weight: Array) -> Array:
     """Returns sum(weight * x) / sum(weight), [], over all axes; 0 where all weights are 0."""
-    whole, weights = total(shards, lambda x, w: ((w * x).sum(), w.sum()), x, weight)
-    return whole / jnp.maximum(weights, 1.0)
+    return (weight * x).sum() / jnp.maximum(weight.sum(), 1.0)
 
 
-def weighted_variance(x: Array, weight: Array, mean: Array, shards: Shards = WHOLE) -> Array:
-    """Returns the weighted mean of (x - mean)^2, [], over all axes."""
+def weighted_moments(x: Array, weight: Array, shards: Shards = WHOLE) -> tuple[Array, Array, Array]:
+    """Returns sum(weight), at least 1, weighted mean and variance of `x`, [] each, over all axes.
 
-    def sums(x: Array, w: Array) -> tuple[Array, Array]:
-        return (w * jnp.square(x - mean)).sum(), w.sum()
+    Shards' own means and squares are put together as in `normalizer.pool`: one message.
+    """
 
-    whole, weights = total(shards, sums, x, weight)
-    return whole / jnp.maximum(weights, 1.0)
+    def sums(x: Array, w: Array) -> tuple[Array, Array, Array]:
+        number, whole = w.sum(), (w * x).sum()
+        mean = whole / jnp.maximum(number, 1.0)
+        return number, whole, (w * jnp.square(x - mean)).sum()
+
+    numbers, wholes, squares = from_all(shards, sums, x, weight)
+    number = jnp.maximum(add_in_order(numbers), 1.0)
+    mean = add_in_order(wholes) / number
+    apart = wholes / jnp.maximum(numbers, 1.0) - mean
+    return number, mean, add_in_order(squares + numbers * jnp.square(apart)) / number
 
 
 def advantage_scale(advantage: Array, weight: Array, shards: Shards = WHOLE) -> Scale:
     """Returns weighted mean and standard deviation of a minibatch's advantages."""
-    whole, weights = total(shards, lambda x, w: ((w * x).sum(), w.sum()), advantage, weight)
-    weights = jnp.maximum(weights, 1.0)
-    mean = whole / weights
-    squares = total(shards, lambda x, w: (w * jnp.square(x - mean)).sum(), advantage, weight)
-    return Scale(weight=weights, mean=mean, std=jnp.sqrt(squares / weights))
+    number, mean, variance = weighted_moments(advantage, weight, shards)
+    return Scale(weight=number, mean=mean, std=jnp.sqrt(variance))
 
 
 def normalize_advantage(advantage: Array, scale: Scale) -> Array:
@@ -78,8 +82,6 @@ def approximate_kl(log_ratio: Array) -> Array:
 
 def explained_variance(value: Array, target: Array, weight: Array, shards: Shards = WHOLE) -> Array:
     """Returns 1 - Var(target - value) / Var(target), []: 1 is perfect, 0 no better than a mean."""
-    residual = target - value
-    mean = weighted_mean(residual, weight, shards)
-    unexplained = weighted_variance(residual, weight, mean, shards)
-    mean = weighted_mean(target, weight, shards)
-    return 1.0 - unexplained / jnp.maximum(weighted_variance(target, weight, mean, shards), 1e-8)
+    _, _, unexplained = weighted_moments(target - value, weight, shards)
+    _, _, variance = weighted_moments(target, weight, shards)
+    return 1.0 - unexplained / jnp.maximum(variance, 1e-8)

@@ -56,24 +56,17 @@ def each(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
         return function(*parts)
     # XLA inlines a loop that it knows to have one trip, drops barriers, and fuses a lone shard's
     # sums with what follows: other bits than among several (a bias's gradient over 128 samples, on
-    # a CPU). So it is not told how many trips there are, and a lone shard is one of two.
-    places = max(shards.local, 2)
-    if shards.local == 1:
-        parts = jax.tree.map(lambda x: jnp.concatenate([x, x]), parts)
-    number = jax.tree.leaves(parts)[0].ravel()[0].astype(jnp.float32)
-    trips = jnp.int32(shards.local) + (number < -jnp.inf)  # nothing is, NaN neither
+    # a CPU). It leaves a branch alone whose condition it does not know: no number is below -inf.
+    shown = jax.tree.leaves(parts)[0].ravel()[0].astype(jnp.float32)
+    shapes = jax.eval_shape(function, *jax.tree.map(lambda x: x[0], parts))
 
-    def alone(i: Array) -> PyTree:
-        one = jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, i, keepdims=False), parts)
-        return function(*one)
+    def alone(one: PyTree) -> PyTree:
+        def nothing(*_: PyTree) -> PyTree:
+            return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
-    def step(i: Array, made: PyTree) -> PyTree:
-        return jax.tree.map(lambda results, result: results.at[i].set(result), made, alone(i))
+        return jax.lax.cond(shown < -jnp.inf, nothing, function, *one)
 
-    shapes = jax.eval_shape(alone, trips)
-    made = jax.tree.map(lambda x: jnp.zeros((places, *x.shape), x.dtype), shapes)
-    made = jax.lax.fori_loop(0, trips, step, made)
-    return jax.tree.map(lambda x: x[: shards.local], made)
+    return jax.lax.map(alone, parts)
 
 
 def move(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
@@ -83,9 +76,14 @@ def move(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
 
 def total(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
     """Returns the sum over all V shards of `function` of each, the same on every device."""
+    return jax.tree.map(add_in_order, from_all(shards, function, *parts))
+
+
+def from_all(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
+    """Returns `function` of each of all V shards, stacked [V, ...], the same on every device."""
     if shards.number == 1:
-        return function(*parts)
-    return jax.tree.map(add_in_order, gather(shards, each(shards, function, *parts)))
+        return jax.tree.map(lambda x: x[None], function(*parts))
+    return gather(shards, each(shards, function, *parts))
 
 
 def gather(shards: Shards, parts: PyTree) -> PyTree:

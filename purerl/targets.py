@@ -113,8 +113,9 @@ def renew(config: Config, network: Network, params: PyTree, batch: Batch, memory
 
     The values of truncated episodes' last observations stay those of the rollout.
     """
-    seen = jax.tree.map(lambda *x: jnp.concatenate(x), batch.observation, batch.following)
-    values = network.apply(params, seen, memory)[0].value
+    # Apart from each other: the loss applies the network to the first again, and XLA once for both.
+    value = network.apply(params, batch.observation, memory)[0].value
+    last_value = network.apply(params, batch.following, memory)[0].value[0]
     assert batch.course is not None
-    advantage, target = estimate(config, batch.course, values[:-1], values[-1])
+    advantage, target = estimate(config, batch.course, value, last_value)
     return batch._replace(advantage=advantage, target=target)

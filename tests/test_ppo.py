@@ -339,18 +339,22 @@ def test_a_lost_sample_has_no_weight_in_the_update():
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("recurrent", [False, True])
-def test_a_gradient_in_slices_is_the_same_sum(monkeypatch, recurrent):
-    """As on a GPU: of 3 minibatches of 32 samples, or of 2 sequences, each in 2 slices."""
+@pytest.mark.parametrize(
+    "recurrent, segment_length, size",
+    [(False, 0, (1, 32)), (True, 0, (16, 2)), (False, 4, (4, 8))],
+)
+def test_a_gradient_in_slices_is_the_same_sum(monkeypatch, recurrent, segment_length, size):
+    """As on a GPU: of 3 minibatches of samples, sequences or segments, each in 2 slices."""
     env, network, state = setup(recurrent=recurrent)
+    config = dataclasses.replace(CONFIG, segment_length=segment_length)
     memory = state.carry  # before the rollout
-    after, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
-    batch = targets.make_batch(CONFIG, after, transitions, last_value, state.episode.length == 0)
-    whole, metrics = learner.learn(CONFIG, network, after, batch, memory)
+    after, transitions, _, last_value = ROLLOUT(config, env, network, state)
+    batch = targets.make_batch(config, after, transitions, last_value, state.episode.length == 0)
+    whole, metrics = learner.learn(config, network, after, batch, memory)
     asked = []
     monkeypatch.setattr(learner, "count_slices", lambda *size: asked.append(size) or 2)
-    sliced, others = learner.learn(CONFIG, network, after, batch, memory)
-    assert asked == [(16, 2, "cpu") if recurrent else (1, 32, "cpu")]
+    sliced, others = learner.learn(config, network, after, batch, memory)
+    assert asked == [(*size, "cpu")]
     for a, b in zip(jax.tree.leaves(whole.params), jax.tree.leaves(sliced.params), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4)
     assert float(others["value_loss"]) == pytest.approx(float(metrics["value_loss"]), rel=1e-3)
