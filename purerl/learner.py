@@ -223,7 +223,7 @@ def minibatch_step(
     batch, memory = move(shards, functools.partial(cut_in_slices, number), batch, memory)
     if config.segment_length:
         anew = functools.partial(renew, config, network, as_tree(learner.params))
-        batch = each(shards, functools.partial(of_slices, number, anew, 1), batch, memory)
+        batch = each(shards, functools.partial(of_slices, number, anew), batch, memory)
     scale = losses.advantage_scale(batch.advantage, batch.weight, shards)
 
     def gradient(batch: Batch, memory: PyTree) -> tuple[tuple[Array, Metrics], PyTree]:
@@ -267,30 +267,27 @@ def count_slices(rows: int, columns: int, platform: str) -> int:
 
 
 def cut_in_slices(number: int, batch: Batch, memory: PyTree) -> tuple[Batch, PyTree]:
-    """Cuts a minibatch [T', M'] and its memory [M'] into N slices, [T', N, M' / N] and [N, M' / N].
+    """Cuts a minibatch [T', M'] and its memory [M'] into N slices, [N, T', M' / N] and [N, M' / N].
 
     One slice is the minibatch as it is.
     """
 
     def cut(x: Array, axis: int) -> Array:
-        return x.reshape(*x.shape[:axis], number, -1, *x.shape[axis + 1 :])
+        return jnp.moveaxis(x.reshape(*x.shape[:axis], number, -1, *x.shape[axis + 1 :]), axis, 0)
 
     if number == 1:
         return batch, memory
     return jax.tree.map(lambda x: cut(x, 1), batch), jax.tree.map(lambda x: cut(x, 0), memory)
 
 
-def of_slices(
-    number: int, function: Callable, out_axis: int, batch: Batch, memory: PyTree
-) -> PyTree:
-    """Returns `function` of every slice, computed side by side, [N] of them at `out_axis`."""
-    of_all = function if number == 1 else jax.vmap(function, (1, 0), out_axis)
-    return of_all(batch, memory)
+def of_slices(number: int, function: Callable, batch: Batch, memory: PyTree) -> PyTree:
+    """Returns `function` of every slice, [N, ...], computed side by side."""
+    return function(batch, memory) if number == 1 else jax.vmap(function)(batch, memory)
 
 
 def sum_of_slices(number: int, function: Callable, batch: Batch, memory: PyTree) -> PyTree:
     """Returns the sum of `function` of every slice."""
-    parts = of_slices(number, function, 0, batch, memory)
+    parts = of_slices(number, function, batch, memory)
     return parts if number == 1 else jax.tree.map(add_in_order, parts)
 
 

@@ -217,7 +217,11 @@ def test_segments_are_estimated_from_the_values_of_now(length):
     after, transitions, _, last_value = ROLLOUT(config, env, network, state)
     batch = targets.make_batch(config, after, transitions, last_value, state.episode.length == 0)
     params = jax.tree.map(lambda x: 1.5 * x + 0.1, state.params)
-    renewed = targets.renew(config, network, params, targets.in_segments(length, batch), ())
+    segments = targets.in_segments(length, batch)
+    renewed = targets.renew(config, network, params, segments, ())
+    np.testing.assert_array_equal(renewed.log_prob, segments.log_prob.reshape(1, -1))
+    advantage = renewed.advantage.reshape(length, -1)
+    target = renewed.target.reshape(length, -1)
 
     def value_of(features):
         return np.asarray(network.apply(params, features, ())[0].value)
@@ -238,9 +242,8 @@ def test_segments_are_estimated_from_the_values_of_now(length):
         end = following[i + length - 1]
         expected = slow_batch(part, end, before_reset, kept_value, 0.9, config.gae_lambda)
         columns = slice(i // length * 6, (i // length + 1) * 6)
-        found = renewed.advantage[:, columns], renewed.target[:, columns]
-        np.testing.assert_allclose(found[0], expected, rtol=1e-4, atol=1e-5)
-        np.testing.assert_allclose(found[1], expected + part.value, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(advantage[:, columns], expected, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(target[:, columns], expected + part.value, rtol=1e-4, atol=1e-5)
 
 
 def test_segments_stay_whole_and_are_renewed_before_each_gradient_step(monkeypatch):

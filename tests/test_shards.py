@@ -124,6 +124,21 @@ def test_by_default_every_device_has_a_shard(tmp_path, words):
     assert "device_count" not in facts["flags"]["XLA_FLAGS"]
 
 
+def test_what_is_set_apart_stays_as_it_is():
+    tree = {
+        "float": jnp.array([[0.0, -0.0], [jnp.inf, -1e-42]]),
+        "half": jnp.array(1.5, jnp.bfloat16),
+        "int": jnp.array([-(2**31), 0, 7]),
+        "unsigned": jnp.array([0, 2**32 - 1], jnp.uint32),
+        "truth": jnp.array([True, False]),
+        "nothing": jnp.zeros((0, 3)),
+    }
+    for apart in (shards.set_apart, jax.jit(shards.set_apart)):
+        for before, after in zip(jax.tree.leaves(tree), jax.tree.leaves(apart(tree)), strict=True):
+            assert (after.shape, after.dtype) == (before.shape, before.dtype)
+            assert np.asarray(after).tobytes() == np.asarray(before).tobytes()
+
+
 # --- several processes ---
 
 
