@@ -86,7 +86,7 @@ def _compute(eqn: core.JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
         outputs = [rule(eqn.params, *values)]
     else:
         with jax.ensure_compile_time_eval(), on_cpu():
-            outputs = bind_equation(eqn, [jnp.asarray(v) for v in values])
+            outputs = bind_equation(eqn, [jax.device_put(v) for v in values])
     return [np.asarray(x, v.aval.dtype) for x, v in zip(outputs, eqn.outvars, strict=True)]
 
 
@@ -114,6 +114,19 @@ def _slice(p: dict, x: np.ndarray) -> np.ndarray:
     strides = p["strides"] or (1,) * x.ndim
     limits = zip(p["start_indices"], p["limit_indices"], strides, strict=True)
     return x[tuple(slice(*s) for s in limits)]
+
+
+def _iota(p: dict) -> np.ndarray:
+    shape = [1] * len(p["shape"])
+    shape[p["dimension"]] = -1
+    counted = np.arange(p["shape"][p["dimension"]], dtype=p["dtype"])
+    return np.broadcast_to(counted.reshape(shape), p["shape"])
+
+
+def _cumulative_sum(p: dict, x: np.ndarray) -> np.ndarray:
+    if p["reverse"]:
+        return np.flip(np.flip(x, p["axis"]).cumsum(p["axis"], x.dtype), p["axis"])
+    return x.cumsum(p["axis"], x.dtype)
 
 
 def _remainder(p: dict, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -147,6 +160,8 @@ _RULES: dict[str, Callable[..., np.ndarray]] = {
     }.items()
 }
 _RULES |= {"broadcast_in_dim": _broadcast, "slice": _slice, "rem": _remainder, "select_n": _select}
+_RULES |= {"iota": _iota, "cumsum": _cumulative_sum, "sign": lambda p, x: np.sign(x)}
+_RULES["reshape"] = lambda p, x: x.reshape(p["new_sizes"])
 _RULES["convert_element_type"] = lambda p, x: x.astype(p["new_dtype"])
 _RULES["squeeze"] = lambda p, x: np.squeeze(x, p["dimensions"])
 _RULES["transpose"] = lambda p, x: np.transpose(x, p["permutation"])
