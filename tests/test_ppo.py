@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from purerl import evaluation, learner, networks, normalizer, ppo, targets
+from purerl import evaluation, learner, networks, normalizer, ppo, slices, targets
 from purerl.env import State
 from purerl.rollout import rollout
 from purerl.types import count_as_int
@@ -444,7 +444,7 @@ def test_a_memory_may_hold_integers():
     ],
 )
 def test_slices_are_equal_and_not_too_small(rows, columns, platform, number):
-    assert learner.count_slices(rows, columns, platform) == number
+    assert slices.count_slices(rows, columns, platform) == number
 
 
 def test_a_non_finite_minibatch_is_skipped_and_counted():
