@@ -124,6 +124,17 @@ def test_by_default_every_device_has_a_shard(tmp_path, words):
     assert "device_count" not in facts["flags"]["XLA_FLAGS"]
 
 
+def test_the_check_of_a_persons_own_devices():
+    """Its short form, on two virtual ones."""
+    words = ["2", "--", str(TOY), "--ppo.num-envs", "16", "--ppo.num-steps", "512"]
+    said = subprocess.run(
+        [sys.executable, "-m", "tests.shards_check", *words],
+        cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True, timeout=200,
+    ).stdout  # fmt: skip
+    (one, *_, first), (two, *_, second) = (line.split() for line in said.splitlines()[1:])
+    assert (one, two) == ("1", "2") and first == second and len(first) == 16
+
+
 def test_what_is_set_apart_stays_as_it_is():
     tree = {
         "float": jnp.array([[0.0, -0.0], [jnp.inf, -1e-42]]),
