@@ -1,4 +1,4 @@
-"""How cost grows: steps/s and memory over environments, rollout length, width and seeds.
+"""How cost grows: steps/s and memory over environments, rollout length, width, cores and seeds.
 
     python -m experiments.scaling --csv docs/scaling.csv
     python -m experiments.scaling --axes envs --experiment ant_run --engine jax
@@ -14,6 +14,7 @@ import argparse
 import csv
 import dataclasses
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -28,10 +29,12 @@ from purerl import ppo, rundir
 from purerl.errors import UserError, leave, output_file
 from purerl.experiment import Experiment, find
 
+HERE = sorted(os.sched_getaffinity(0))  # cores that this process may use
 AXES: dict[str, tuple[int, ...]] = {
     "envs": (64, 256, 1024, 4096, 16384),
     "length": (8, 32, 128),
     "width": (32, 128, 512),
+    "cores": tuple(2**i for i in range(len(HERE).bit_length())),
     "seeds": (1, 2, 4, 8),
 }
 FIELDS = ("axis", "value", "steps_per_s", "physics_steps_per_s", "share", "compile_s")
@@ -64,7 +67,7 @@ def point(experiment: Experiment, name: str, engine: str, axis: str, value: int)
         command += ["--rounds", "2", "--least-s", "0.5", "--json", str(file)]
         command += ["--parts", "physics alone", "update"]
         command += overrides(axis, value, experiment.ppo)
-        if subprocess.run(command, stdout=subprocess.DEVNULL).returncode:  # it has told why
+        if run_on(value if axis == "cores" else len(HERE), command):  # it has told why
             raise UserError(f"Measuring {axis} {value} failed; see above.")
         found = json.loads(file.read_text())
     physics, update = found["parts"]
@@ -81,6 +84,15 @@ def point(experiment: Experiment, name: str, engine: str, axis: str, value: int)
         "update_mb": round(held["update"] / 1e6, 2),
         "process_mb": round(list(held.values())[-1] / 1e6),
     }
+
+
+def run_on(cores: int, command: list[str]) -> int:
+    """Runs a command on the first so many of the cores; returns its exit code."""
+    os.sched_setaffinity(0, HERE[:cores])  # a child inherits it
+    try:
+        return subprocess.run(command, stdout=subprocess.DEVNULL).returncode
+    finally:
+        os.sched_setaffinity(0, HERE)
 
 
 def seeds_point(experiment: Experiment, engine: str, number: int) -> dict[str, Any]:

@@ -8,6 +8,7 @@ function of its arguments, which is what `jax.pure_callback` asks for.
 import copy
 import functools
 import math
+import os
 import threading
 from typing import Any
 
@@ -76,8 +77,18 @@ class CEngine:
     def batch(self, number: int, names: tuple[str, ...]) -> Batch:
         """Returns the simulations for `number` environments with the changed fields `names`."""
         if (number, names) not in self.batches:
-            self.batches[number, names] = Batch(_movable(self.model, names), number)
+            model = _movable(self.model, names)
+            self.batches[number, names] = Batch(model, number, nthread=usable_cores())
         return self.batches[number, names]
+
+
+def usable_cores() -> int:
+    """Returns how many cores this process may use, on a shared machine fewer than it has.
+
+    MuJoCo by itself starts a thread for each that there is: 64 of them on two cores stepped ants at
+    0.74 of the rate of two.
+    """
+    return len(os.sched_getaffinity(0))
 
 
 def _movable(model: mujoco.MjModel, names: tuple[str, ...]) -> mujoco.MjModel:

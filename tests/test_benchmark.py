@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import os
 import sys
 from types import SimpleNamespace
 
@@ -143,6 +144,11 @@ def test_a_point_reads_the_benchmark_it_started(monkeypatch):
     row = scaling.point(find("ant_run").experiment, "ant_run", "c", "envs", 64)
     assert (row["steps_per_s"], row["physics_steps_per_s"], row["share"]) == (150, 200, 0.75)
     assert (row["state_mb"], row["update_mb"], row["process_mb"]) == (2.0, 5.0, 900)
+    before = os.sched_getaffinity(0)
+    on = []
+    monkeypatch.setattr(os, "sched_setaffinity", lambda _, cores: on.append(set(cores)))
+    scaling.point(find("ant_run").experiment, "ant_run", "c", "cores", 1)
+    assert on == [{min(before)}, before]  # the child's, then one's own again
     ended = 2
     with pytest.raises(UserError, match="envs 64 failed"):
         scaling.point(find("ant_run").experiment, "ant_run", "c", "envs", 64)

@@ -38,7 +38,8 @@ EFFECTS = {
     "video",
 }
 PURE = sorted(set(FILES) - EFFECTS - {"__init__"})
-# The one host call above the line: MuJoCo's C code, a pure function of its arguments.
+# The one host call above the line: MuJoCo's C code, a pure function of its arguments, on as many
+# threads as this process has cores.
 HOST_CALL = {"engine_c"}
 FORBIDDEN_CALLS = {"print", "open", "input", "exec", "eval", "__import__"}
 FORBIDDEN_MODULES = {"time", "datetime", "os", "sys", "random", "subprocess", "logging", "pathlib"}
@@ -79,7 +80,8 @@ def test_pure_modules_import_no_effects(name):
 @pytest.mark.parametrize("name", PURE)
 def test_pure_modules_have_no_effects(name):
     path = FILES[name]
-    assert not {m.split(".")[0] for m in imports(path)} & FORBIDDEN_MODULES
+    forbidden = FORBIDDEN_MODULES - ({"os"} if name in HOST_CALL else set())
+    assert not {m.split(".")[0] for m in imports(path)} & forbidden
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
             assert node.func.id not in FORBIDDEN_CALLS, f"line {node.lineno}"

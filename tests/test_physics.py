@@ -1,5 +1,6 @@
 """Engines behind `Physics`: what they promise, against MuJoCo itself and against each other."""
 
+import copy
 import functools
 import subprocess
 import sys
@@ -94,6 +95,19 @@ def trajectory(engine):
         seen.append((state, readings))
     states, readings = jax.tree.map(lambda *x: jnp.stack(x), *seen)
     return first, states, readings, controls
+
+
+@pytest.mark.parametrize("cores", [{0}, {0, 7}])
+def test_c_has_a_thread_for_each_core_that_it_may_use_and_the_same_bits(monkeypatch, cores):
+    """A job on a cluster may use a few of many, and MuJoCo by itself takes all."""
+    _, states, _, controls = trajectory("c")
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: cores)
+    p = Physics(copy.copy(biped()), READINGS, substeps=3, engine="c")
+    state, _ = jax.vmap(p.init)(*starts(NUMBER, biped()))
+    assert p._engine.batch(NUMBER, ()).nthread == len(cores)
+    for control, *expected in zip(controls, *jax.tree.leaves(states), strict=True):
+        state, _ = jax.vmap(p.step)(state, control)
+        jax.tree.map(np.testing.assert_array_equal, jax.tree.leaves(state), expected)
 
 
 def test_c_is_mujoco_with_its_state_rounded_at_control_steps():
