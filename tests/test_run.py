@@ -208,6 +208,24 @@ def test_a_beginning_has_the_same_bits_however_it_is_compiled(num_shards):
     assert len(digests) == 1
 
 
+def test_with_xla_on_one_thread_the_cores_do_not_matter(tmp_path):
+    """MuJoCo's threads change no bits; the size of XLA's own pool does, for this ant."""
+    words = ["ant_run", "--engine", "c", "--ppo.num-envs", "64", "--ppo.num-steps", "4096"]
+    words += ["--evaluation.number", "0", "--runs", str(tmp_path)]
+    own = sorted(os.sched_getaffinity(0))
+    try:
+        for number in {1, len(own)}:
+            os.sched_setaffinity(0, own[:number])  # the child inherits it
+            subprocess.run(
+                [sys.executable, "-m", "purerl.run", *words, "--name", str(number)],
+                cwd=ROOT, env=os.environ | {"NPROC": "1"}, check=True, stdout=subprocess.DEVNULL,
+            )  # fmt: skip
+    finally:
+        os.sched_setaffinity(0, own)
+    last = [path.read_text().splitlines()[-1] for path in tmp_path.glob("*/*/metrics.jsonl")]
+    assert len({json.loads(line)["digest"] for line in last}) == 1
+
+
 @pytest.mark.parametrize("signals", [[signal.SIGKILL], [signal.SIGTERM]])
 def test_a_killed_process_resumes_to_the_same_bits(tmp_path, signals):
     process = spawn(tmp_path, *LONG)
