@@ -83,7 +83,7 @@ def list_scatter_sums(closed: core.ClosedJaxpr) -> list[ScatterSum]:
     for eqn in closed.jaxpr.eqns:
         if _is_unordered(eqn):
             found.append(ScatterSum(eqn.primitive.name, eqn.invars[0].aval.shape, source(eqn)))
-        for sub in _sub_jaxprs(eqn):
+        for sub in sub_jaxprs(eqn):
             found += list_scatter_sums(sub)
     return found
 
@@ -97,7 +97,7 @@ def _is_unordered(eqn: core.JaxprEqn) -> bool:
     return sums and jnp.issubdtype(eqn.invars[0].aval.dtype, jnp.inexact)
 
 
-def _sub_jaxprs(eqn: core.JaxprEqn) -> list[core.ClosedJaxpr]:
+def sub_jaxprs(eqn: core.JaxprEqn) -> list[core.ClosedJaxpr]:
     """Returns the traces inside one equation (loop bodies, branches, called functions)."""
     found = []
     for value in eqn.params.values():
@@ -110,7 +110,7 @@ def _sub_jaxprs(eqn: core.JaxprEqn) -> list[core.ClosedJaxpr]:
 
 
 def _has_scatter_sum(eqn: core.JaxprEqn) -> bool:
-    return any(list_scatter_sums(sub) for sub in _sub_jaxprs(eqn))
+    return any(list_scatter_sums(sub) for sub in sub_jaxprs(eqn))
 
 
 def _prune(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:

@@ -157,10 +157,11 @@ _RULES: dict[str, Callable[..., np.ndarray]] = {
         "and": np.bitwise_and,
         "or": np.bitwise_or,
         "not": np.invert,
+        "sign": np.sign,
     }.items()
 }
 _RULES |= {"broadcast_in_dim": _broadcast, "slice": _slice, "rem": _remainder, "select_n": _select}
-_RULES |= {"iota": _iota, "cumsum": _cumulative_sum, "sign": lambda p, x: np.sign(x)}
+_RULES |= {"iota": _iota, "cumsum": _cumulative_sum}
 _RULES["reshape"] = lambda p, x: x.reshape(p["new_sizes"])
 _RULES["convert_element_type"] = lambda p, x: x.astype(p["new_dtype"])
 _RULES["squeeze"] = lambda p, x: np.squeeze(x, p["dimensions"])

@@ -19,7 +19,7 @@ from purerl.keys import Purpose, derive
 from purerl.rollout import select
 from purerl.shards import WHOLE, Shards, each, move, numbers, total
 from purerl.slices import count_slices, cut_in_slices, of_slices, sum_of_slices
-from purerl.targets import Batch, in_segments, renew
+from purerl.targets import Batch, in_one_row, in_segments, renew
 from purerl.types import Array, Metrics, Network, PolicyOutput, PyTree, TrainState
 
 PLACE = 64  # numbers: 128 bytes of any type
@@ -88,7 +88,7 @@ def learn(
         batch = move(shards, functools.partial(in_segments, config.segment_length), batch)
     elif not is_recurrent(memory):
         # One long row of samples: a minibatch is any of them, [1, M].
-        batch = move(shards, _in_one_row, batch)
+        batch = move(shards, in_one_row, batch)
     columns = batch.weight.shape[-1]
     params, as_tree = in_one_vector(state.params)
     rate = scheduled_rate(config, state)
@@ -121,10 +121,6 @@ def learn(
         ),
     }
     return state, metrics
-
-
-def _in_one_row(batch: Batch) -> Batch:
-    return jax.tree.map(lambda x: x.reshape(1, -1, *x.shape[2:]), batch)
 
 
 def _take(batch: Batch, memory: PyTree, index: Array) -> tuple[Batch, PyTree]:

@@ -9,7 +9,6 @@ several, arrays of a device's shards are stacked, [v, ...], and the code runs in
 `jax.shard_map` over a mesh with the axis `AXIS` if there are several devices.
 """
 
-import re
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -19,6 +18,7 @@ import numpy as np
 from jax.extend import core
 
 from purerl.config import check_divides
+from purerl.deterministic import sub_jaxprs
 from purerl.types import Array, PyTree
 
 AXIS = "devices"
@@ -58,8 +58,9 @@ def each(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
         return function(*parts)
     # A device that has one shard computes it as one that has several, alone and not in a loop: what
     # it reads and what it makes is set apart, the arrays that `function` closes over as well.
-    closed, shapes = jax.make_jaxpr(function, return_shape=True)(*_first(parts))
-    loops = has_loop(closed.jaxpr)
+    first = jax.tree.map(lambda x: x[0], parts)
+    closed, shapes = jax.make_jaxpr(function, return_shape=True)(*first)
+    loops = has_loop(closed)
 
     def alone(one: PyTree) -> list[Array]:
         consts, leaves = set_apart((closed.consts, jax.tree.leaves(one)))
@@ -69,13 +70,12 @@ def each(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
     return jax.tree.unflatten(jax.tree.structure(shapes), jax.lax.map(alone, parts))
 
 
-def _first(parts: PyTree) -> PyTree:
-    return jax.tree.map(lambda x: x[0], parts)
-
-
-def has_loop(jaxpr: core.Jaxpr) -> bool:
-    """Tells whether a program loops anywhere, as it is written out."""
-    return re.search(r"\b(scan|while)\[", str(jaxpr)) is not None
+def has_loop(closed: core.ClosedJaxpr) -> bool:
+    """Tells whether a trace loops, at any depth."""
+    return any(
+        eqn.primitive.name in ("scan", "while") or any(map(has_loop, sub_jaxprs(eqn)))
+        for eqn in closed.jaxpr.eqns
+    )
 
 
 def in_branch(compute: Callable, *leaves: Array) -> list[Array]:

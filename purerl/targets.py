@@ -108,21 +108,22 @@ def in_segments(length: int, batch: Batch) -> Batch:
     return jax.tree.map(cut, batch._replace(following=None))._replace(following=following)
 
 
+def in_one_row(samples: PyTree) -> PyTree:
+    """Returns samples [T, B, ...] one after another, [1, T * B, ...]."""
+    return jax.tree.map(lambda x: x.reshape(1, -1, *x.shape[2:]), samples)
+
+
 def renew(config: Config, network: Network, params: PyTree, batch: Batch, memory: PyTree) -> Batch:
     """Estimates segments [L, M] anew, from what `params` say of them and of what follows.
 
     The values of truncated episodes' last observations stay those of the rollout. Returns the
     samples in one row [1, L * M]: of rows, XLA made transposed copies in the loss's gradient.
     """
-
-    def in_one_row(x: Array) -> Array:
-        return x.reshape(1, -1, *x.shape[2:])
-
     assert batch.course is not None
-    row = jax.tree.map(in_one_row, batch._replace(course=None, following=None))
+    row = in_one_row(batch._replace(course=None, following=None))
     # Apart from each other: the loss applies the network to the first again, and XLA once for both.
     value = network.apply(params, row.observation, memory)[0].value
     last_value = network.apply(params, batch.following, memory)[0].value[0]
-    estimated = estimate(config, batch.course, value.reshape(batch.weight.shape), last_value)
-    advantage, target = map(in_one_row, estimated)
+    value = value.reshape(batch.weight.shape)
+    advantage, target = in_one_row(estimate(config, batch.course, value, last_value))
     return row._replace(advantage=advantage, target=target)

@@ -14,13 +14,15 @@ run [control steps/s]:
 """
 
 import argparse
-import json
 import os
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 from typing import NamedTuple
+
+from purerl import history
+from purerl.history import History
 
 FLAGS = {
     "as it is": "",
@@ -76,23 +78,32 @@ def twins(variant: str, words: list[str], runs: Path) -> tuple[Result, Result]:
 def make(variant: str, words: list[str], runs: Path, name: str) -> Result:
     """Makes a run in a process of its own; ends the check if it fails."""
     program = ["-c", PLAIN] if variant == "no measures" else ["-m", "purerl.run"]
-    environment = os.environ | {
+    environment = {
         "JAX_COMPILATION_CACHE_DIR": str(runs / f"cache-{name}"),
         "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {FLAGS[variant]}".strip(),
     }
+    run = run_quietly(program, words, runs, name, environment)
+    return Result(run.lines[-1]["digest"], speed(run), run.manifest["bit_exact"])
+
+
+def run_quietly(
+    program: list[str], words: list[str], runs: Path, name: str, environment: dict[str, str]
+) -> History:
+    """Makes a run in a process of its own, in so changed an environment; ends all if it fails."""
     done = subprocess.run(
         [sys.executable, *program, *words, *QUIET, "--runs", str(runs), "--name", name],
-        env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        env=os.environ | environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
     )  # fmt: skip
     if done.returncode:
-        sys.exit(f"{variant}, {name} run: exit code {done.returncode}\n{done.stdout}")
-    folder = next(runs.glob(f"*/{name}"))
-    lines = [json.loads(line) for line in (folder / "metrics.jsonl").open()]
-    start, end = lines[len(lines) // 4], lines[-1]
+        sys.exit(f"The run {name}: exit code {done.returncode}\n{done.stdout}")
+    return history.read(next(runs.glob(f"*/{name}")))
+
+
+def speed(run: History) -> float:
+    """Returns a run's control steps per second after its first quarter."""
+    start, end = run.lines[len(run.lines) // 4], run.lines[-1]
     seconds = end["wall_s"] - start["wall_s"]
-    speed = (end["steps"] - start["steps"]) / seconds if seconds else 0.0
-    facts = json.loads((folder / "manifest.json").read_text())
-    return Result(end["digest"], speed, facts["bit_exact"])
+    return (end["steps"] - start["steps"]) / seconds if seconds else 0.0
 
 
 if __name__ == "__main__":

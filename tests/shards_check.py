@@ -16,11 +16,12 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
-from purerl import history, twins
+from purerl import twins
 from purerl.history import History
+from tests.gpu_check import run_quietly, speed
 
-QUIET = ["--evaluation.number", "0", "--checkpoints", "1"]
 FIND = "import jax; print(jax.default_backend(), jax.device_count())"
 
 
@@ -36,53 +37,45 @@ def main() -> int:
     # In a process of its own: this one shall hold no GPU.
     found = subprocess.check_output([sys.executable, "-c", FIND], text=True).split()
     gpus = int(found[1]) if found[0] == "gpu" else 0
-    numbers = [n for n in range(1, (gpus or options.shards) + 1) if options.shards % n == 0]
+    there = gpus or options.shards
+    numbers = [n for n in range(1, there + 1) if options.shards % n == 0]
+    if len(numbers) < 2:
+        parser.error(
+            f"{options.shards} shards and {there} devices leave nothing to compare: the number of "
+            "shards must be a multiple of 2, or of another number of devices that are there."
+        )
     same = True
     print("{:8} {:>12}  {}".format("devices", "steps/s", "digest"), flush=True)
     with tempfile.TemporaryDirectory() as folder:
         runs = []
         for number in numbers:
-            run = make(options.shards, number, gpus > 0, options.words, Path(folder))
+            words = [*options.words, "--num-shards", str(options.shards)]
+            shown = show(number, gpus > 0, options.shards)
+            run = run_quietly(["-m", "purerl.run"], words, Path(folder), f"devices{number}", shown)
             runs.append(run)
             digest = run.lines[-1]["digest"]
             print(f"{number:<8} {speed(run):>12,.0f}  {digest[:16]}", flush=True)
-            compared = twins.compare(runs[0], run)
-            if not compared.same or compared.parted:
+            if figures(run) != figures(runs[0]):
                 same = False
-                print("\n".join(f"  {line}" for line in compared.lines), flush=True)
+                lines = twins.compare(runs[0], run).lines
+                print("\n".join(f"  {line}" for line in lines), flush=True)
     return 0 if same else 1
 
 
-def make(shards: int, devices: int, on_gpus: bool, words: list[str], runs: Path) -> History:
-    """Makes the run on so many devices; ends the check if it fails."""
-    name = f"devices{devices}"
-    done = subprocess.run(
-        [sys.executable, "-m", "purerl.run", *words, *QUIET, "--num-shards", str(shards),
-         "--runs", str(runs), "--name", name],
-        env=os.environ | show(devices, on_gpus),
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-    )  # fmt: skip
-    if done.returncode:
-        sys.exit(f"{devices} devices: exit code {done.returncode}\n{done.stdout}")
-    return history.read(next(runs.glob(f"*/{name}")))
-
-
-def show(devices: int, on_gpus: bool) -> dict[str, str]:
+def show(devices: int, on_gpus: bool, most: int) -> dict[str, str]:
     """Returns the environment in which JAX finds so many devices."""
     if on_gpus:
         default = ",".join(map(str, range(devices)))
         shown = os.environ.get("CUDA_VISIBLE_DEVICES", default).split(",")
         return {"CUDA_VISIBLE_DEVICES": ",".join(shown[:devices])}
-    # The size of XLA's pool changes bits on a CPU, and it is no smaller than the devices.
+    # The size of XLA's pool changes bits on a CPU, and it must hold the most devices.
     flags = f"--xla_force_host_platform_device_count={devices}"
-    return {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip(), "NPROC": "8"}
+    return {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip(), "NPROC": str(most)}
 
 
-def speed(run: History) -> float:
-    """Returns a run's control steps per second after its first quarter."""
-    start, end = run.lines[len(run.lines) // 4], run.lines[-1]
-    seconds = end["wall_s"] - start["wall_s"]
-    return (end["steps"] - start["steps"]) / seconds if seconds else 0.0
+def figures(run: History) -> list[dict[str, Any]]:
+    """Returns a run's metrics and digests without the clock."""
+    return [line | {"wall_s": 0} for line in run.lines]
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from purerl.deterministic import _sub_jaxprs, trace_deterministic
+from purerl.deterministic import sub_jaxprs, trace_deterministic
 
 LIMIT = 5
 
@@ -28,7 +28,7 @@ def newton(x, start=0, limit=LIMIT, step=1):
 def primitives(closed):
     """Returns the names of all primitives of a trace, at any depth."""
     found = {eqn.primitive.name for eqn in closed.jaxpr.eqns}
-    return found.union(*(primitives(s) for eqn in closed.jaxpr.eqns for s in _sub_jaxprs(eqn)))
+    return found.union(*(primitives(s) for eqn in closed.jaxpr.eqns for s in sub_jaxprs(eqn)))
 
 
 def test_a_counted_loop_becomes_a_scan_that_stops_where_the_loop_did():
