@@ -234,7 +234,7 @@ def main(arguments: list[str]) -> int:
     options, overrides = parser.parse_known_args(arguments)
     if options.start_up:
         return start_up.main([options.experiment, *overrides])
-    kernels.fix_choice()  # as a run does, before JAX starts
+    kernels.set_flags()  # as a run does, before JAX starts
     prog = f"python -m experiments.benchmark {options.experiment}"
     experiment, _ = run.from_command_line(cli.parse, find(options.experiment), overrides, prog)
     bench = make_bench(experiment, options.parts)

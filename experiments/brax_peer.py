@@ -269,7 +269,7 @@ def main(arguments: list[str]) -> int:
     if options.stretches < 3:
         parser.error(f"--stretches is {options.stretches}; two compile, so it takes at least 3.")
     if "purerl" in options.trainers:
-        kernels.fix_choice()  # before JAX starts; it holds for all in this process
+        kernels.set_flags()  # before JAX starts; it holds for all in this process
     found: dict[str, list[dict]] = {}
     for body in options.bodies:
         sizes, rates = resize(BODIES[body], options.num_envs), []

@@ -236,7 +236,7 @@ def main(arguments: list[str]) -> int:
             print(f"{body}\n\n{table([run for run in runs if run.body == body])}\n")
         return 0
     if options.what != "brax":
-        kernels.fix_choice()  # before JAX starts
+        kernels.set_flags()  # before JAX starts
     with tempfile.TemporaryDirectory() as folder:
         options.cache = options.cache or folder
         Path(options.cache).mkdir(parents=True, exist_ok=True)

@@ -11,6 +11,9 @@ and the learner alike).
 A program of several devices is simplified once more than one of one, before it is partitioned, and
 its sums come out in other shapes and orders: a cart-pole's gradient differed in the seventh digit
 on two GPUs. Without that pass it has the same bits on one and two.
+
+Most kernels are small, in a CUDA graph, and one after another unless XLA is told to let those run
+together that need nothing of each other. It changes no bit: `docs/gpu.md`.
 """
 
 import os
@@ -18,9 +21,14 @@ import os
 LEVEL = "xla_gpu_autotune_level"
 # In the place of what timing would have found out; the last for programs of several devices.
 RULES = {
+    LEVEL: "0",
     "xla_gpu_enable_triton_gemm": "false",
     "xla_gpu_experimental_enable_fusion_block_level_rewriter": "true",
     "xla_disable_hlo_passes": "spmd-simplify",
+}
+GRAPHS = {
+    "xla_gpu_command_buffer_scheduling_mode": "CONCURRENT",
+    "xla_gpu_graph_min_graph_size": "1",
 }
 FIXING_FLAGS = (
     f"{LEVEL}=0",
@@ -31,14 +39,17 @@ FIXING_FLAGS = (
 KEPT_TIMINGS = "JAX_PERSISTENT_CACHE_ENABLE_XLA_CACHES"
 
 
-def fix_choice() -> None:
-    """Turns the timing off, where XLA_FLAGS does not set it; to be called before JAX starts."""
-    flags = os.environ.get("XLA_FLAGS", "")
+def set_flags() -> None:
+    """Sets what XLA_FLAGS does not; to be called before JAX starts.
+
+    Where it says anything of timing, that holds, and none of the `RULES` does.
+    """
+    flags, wanted = os.environ.get("XLA_FLAGS", ""), dict(GRAPHS)
     if not any(name.partition("=")[0] in flags for name in FIXING_FLAGS):
-        rules = [f"--{name}={value}" for name, value in RULES.items() if name not in flags]
-        flags = " ".join([flags, f"--{LEVEL}=0", *rules])
-        os.environ["XLA_FLAGS"] = flags.strip()
+        wanted |= RULES
         os.environ.setdefault(KEPT_TIMINGS, "none")
+    added = [f"--{name}={value}" for name, value in wanted.items() if name not in flags]
+    os.environ["XLA_FLAGS"] = " ".join([flags, *added]).strip()
 
 
 def how_chosen(platform: str) -> str:

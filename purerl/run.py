@@ -111,7 +111,7 @@ def resume_command(arguments: Sequence[str]) -> str:
 
 def command(arguments: Sequence[str]) -> None:
     """Parses, prepares and trains."""
-    kernels.fix_choice()  # before JAX starts
+    kernels.set_flags()  # before JAX starts
     from purerl.cli import parse
     from purerl.distributed import fail_together
     from purerl.launch import execute

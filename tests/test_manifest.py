@@ -80,11 +80,12 @@ def test_a_manifest_says_whether_the_run_is_exact_and_what_prevents_it(monkeypat
     assert warp["bit_exact"] is False and "warp" in warp["inexact_because"][0]
 
 
+GRAPHS = "--xla_gpu_command_buffer_scheduling_mode=CONCURRENT --xla_gpu_graph_min_graph_size=1"
 RULES = (
     "--xla_gpu_experimental_enable_fusion_block_level_rewriter=true "
     "--xla_disable_hlo_passes=spmd-simplify"
 )
-FIXED = f"--xla_gpu_autotune_level=0 --xla_gpu_enable_triton_gemm=false {RULES}"
+FIXED = f"{GRAPHS} --xla_gpu_autotune_level=0 --xla_gpu_enable_triton_gemm=false {RULES}"
 
 
 @pytest.mark.parametrize(
@@ -94,18 +95,27 @@ FIXED = f"--xla_gpu_autotune_level=0 --xla_gpu_enable_triton_gemm=false {RULES}"
         ("--xla_a=b", f"--xla_a=b {FIXED}", "fixed"),
         (
             "--xla_gpu_enable_triton_gemm=true",
-            f"--xla_gpu_enable_triton_gemm=true --xla_gpu_autotune_level=0 {RULES}",
+            f"--xla_gpu_enable_triton_gemm=true {GRAPHS} --xla_gpu_autotune_level=0 {RULES}",
             "fixed",
         ),
-        ("--xla_gpu_autotune_level=4", "--xla_gpu_autotune_level=4", "by timing"),
-        ("--xla_gpu_deterministic_ops=true", "--xla_gpu_deterministic_ops=true", "fixed"),
+        ("--xla_gpu_autotune_level=4", f"--xla_gpu_autotune_level=4 {GRAPHS}", "by timing"),
+        (
+            "--xla_gpu_deterministic_ops=true",
+            f"--xla_gpu_deterministic_ops=true {GRAPHS}",
+            "fixed",
+        ),
+        (
+            GRAPHS.replace("=1", "=5"),
+            f"{GRAPHS} ".replace("=1", "=5") + FIXED[len(GRAPHS) + 1 :],
+            "fixed",
+        ),
     ],
 )
 def test_kernels_are_fixed_unless_the_user_wants_them_timed(monkeypatch, users, after, chosen):
     monkeypatch.setenv("XLA_FLAGS", users or "")
     monkeypatch.delenv(kernels.KEPT_TIMINGS, raising=False)
-    kernels.fix_choice()
-    assert (kernels.KEPT_TIMINGS in os.environ) == (after != users)
+    kernels.set_flags()
+    assert (kernels.KEPT_TIMINGS in os.environ) == (RULES in after)
     assert os.environ["XLA_FLAGS"] == after
     assert kernels.how_chosen("gpu") == chosen and kernels.how_chosen("cpu") == "fixed"
     reasons = manifest.collect("jax", [], kernels.how_chosen("gpu"))["inexact_because"]
