@@ -3,8 +3,9 @@
 They are compiled at the same time, since XLA does not hold Python's lock; where cores are few, the
 evaluation when it is first needed. With the `c` engine an update is two programs, because JAX's
 cache refuses one with a call to the host: so the half that learns is compiled once, not at every
-start. With MJX it is one: acting alone, 256 ants on two cores, never ended (all of XLA's threads
-waiting, jax 0.10.2), where the whole update does.
+start. On a GPU it is two as well, which compile side by side. With MJX on a CPU it is one: acting
+alone, 256 ants on two cores, never ended (all of XLA's threads waiting, jax 0.10.2), where the
+whole update does.
 """
 
 import contextlib
@@ -98,7 +99,8 @@ def compile_programs(
     init, whole, collect, improve, judge = functions
     abstract = jax.eval_shape(init, key)
     seconds: dict[str, float] = {}
-    parts = [("collect", collect), ("improve", improve)] if calls_host else [("update", whole)]
+    in_halves = calls_host or jax.default_backend() == "gpu"
+    parts = [("collect", collect), ("improve", improve)] if in_halves else [("update", whole)]
     given, traced, started = (abstract,), [], []
     for name, part in parts:
         traced.append(jit(name, part, donate_argnums=0).trace(*given))
@@ -111,7 +113,7 @@ def compile_programs(
     compiled = [part.result() for part in started]
     return Programs(
         init=beginning.result() if beginning else begin,
-        update=functools.partial(update, *compiled) if calls_host else compiled[0],
+        update=functools.partial(update, *compiled) if in_halves else compiled[0],
         evaluate=evaluate,
         seconds=dict(seconds),  # the evaluation's may come later
         unordered=sorted({place for part in traced for place in unordered(part)}),

@@ -5,13 +5,11 @@ rate that is constant, linear or steered by the policy's KL.
 """
 
 import functools
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
-from jax.flatten_util import ravel_pytree
 
 from purerl import losses
 from purerl.config import Config
@@ -22,49 +20,22 @@ from purerl.slices import count_slices, cut_in_slices, of_slices, sum_of_slices
 from purerl.targets import Batch, in_one_row, in_segments, renew
 from purerl.types import Array, Metrics, Network, PolicyOutput, PyTree, TrainState
 
-PLACE = 64  # numbers: 128 bytes of any type
-
 
 class Learner(NamedTuple):
     """What a minibatch step changes."""
 
-    params: Array  # [P] all parameters (`in_one_vector`)
-    optimizer: PyTree  # Adam's moments, [P] each
+    params: PyTree
+    optimizer: PyTree  # Adam's moments of all parameters
     learning_rate: Array  # []
     skipped_in_a_row: Array  # [] int32
 
 
 def optimizer(config: Config) -> optax.GradientTransformation:
-    """Clips by global norm, then Adam's direction; the caller multiplies by the learning rate.
-
-    Of gradients [P] in one vector: a gradient step on a GPU then takes 101 kernels instead of 134,
-    0.53 ms instead of 0.64 (H100; policy 4 x 32, value 5 x 256, 10,240 samples).
-    """
+    """Clips by global norm, then Adam's direction; the caller multiplies by the learning rate."""
     return optax.chain(
         optax.clip_by_global_norm(config.max_gradient_norm),
         optax.scale_by_adam(eps=1e-5),
     )
-
-
-def in_one_vector(params: PyTree) -> tuple[Array, Callable[[Array], PyTree]]:
-    """Returns parameters as one vector [P], and the function that makes a tree of such a vector.
-
-    Each parameter begins at a multiple of `PLACE` numbers, with zeros between. On a GPU, XLA hands
-    cuBLAS a part of a vector without copying it, and cuBLAS refuses one that begins anywhere
-    ("cublasLtMatmul: the requested functionality is not supported", jax 0.11.2).
-    """
-
-    def widen(leaf: Array) -> Array:
-        return jnp.pad(leaf.ravel(), (0, -leaf.size % PLACE))
-
-    vector, as_padded = ravel_pytree(jax.tree.map(widen, params))
-
-    def as_tree(vector: Array) -> PyTree:
-        return jax.tree.map(
-            lambda wide, leaf: wide[: leaf.size].reshape(leaf.shape), as_padded(vector), params
-        )
-
-    return vector, as_tree
 
 
 def is_recurrent(carry: PyTree) -> bool:
@@ -90,21 +61,20 @@ def learn(
         # One long row of samples: a minibatch is any of them, [1, M].
         batch = move(shards, in_one_row, batch)
     columns = batch.weight.shape[-1]
-    params, as_tree = in_one_vector(state.params)
     rate = scheduled_rate(config, state)
-    learner = Learner(params, state.optimizer, rate, state.skipped_in_a_row)
+    learner = Learner(state.params, state.optimizer, rate, state.skipped_in_a_row)
     key = derive(state.key, Purpose.PERMUTATION, state.update)
 
     def step(learner: Learner, index: Array) -> tuple[Learner, Metrics]:
         minibatch, start = move(shards, _take, batch, memory, index)
-        return minibatch_step(config, network, as_tree, learner, minibatch, start, shards)
+        return minibatch_step(config, network, learner, minibatch, start, shards)
 
     def epoch(learner: Learner, number: Array) -> tuple[Learner, Metrics]:
         order = shuffle(jax.random.fold_in(key, number), columns, config.num_minibatches, shards)
         return jax.lax.scan(step, learner, order)
 
     learner, metrics = jax.lax.scan(epoch, learner, jnp.arange(config.num_epochs))
-    state = state.replace(**learner._replace(params=as_tree(learner.params))._asdict())
+    state = state.replace(**learner._asdict())
     skipped = metrics.pop("skipped")
     # A skipped minibatch's figures are not finite; they must not hide the others'.
     metrics = {
@@ -205,27 +175,23 @@ def loss(
 def minibatch_step(
     config: Config,
     network: Network,
-    as_tree: Callable[[Array], PyTree],
     learner: Learner,
     batch: Batch,
     memory: PyTree,
     shards: Shards,
 ) -> tuple[Learner, Metrics]:
-    """One gradient step, skipped and counted if any of it is not finite.
-
-    `as_tree` makes the network's parameters of the learner's vector.
-    """
+    """One gradient step, skipped and counted if any of it is not finite."""
     rows, columns = batch.weight.shape[-2:]  # of one shard
     number = count_slices(rows, columns, jax.default_backend())
     batch, memory = move(shards, functools.partial(cut_in_slices, number), batch, memory)
     if config.segment_length:
-        anew = functools.partial(renew, config, network, as_tree(learner.params))
+        anew = functools.partial(renew, config, network, learner.params)
         batch = each(shards, functools.partial(of_slices, number, anew), batch, memory)
     scale = losses.advantage_scale(batch.advantage, batch.weight, shards)
 
     def gradient(batch: Batch, memory: PyTree) -> tuple[tuple[Array, Metrics], PyTree]:
-        def objective(params: Array) -> tuple[Array, Metrics]:
-            return loss(config, network, as_tree(params), scale, batch, memory)
+        def objective(params: PyTree) -> tuple[Array, Metrics]:
+            return loss(config, network, params, scale, batch, memory)
 
         return jax.value_and_grad(objective, has_aux=True)(learner.params)
 
@@ -234,7 +200,9 @@ def minibatch_step(
     norm = optax.tree.norm(gradients)
     sound = jnp.isfinite(objective) & jnp.isfinite(norm)
     updates, optimizer_state = optimizer(config).update(gradients, learner.optimizer)
-    stepped = learner.params - (learner.learning_rate * updates).astype(learner.params.dtype)
+    stepped = jax.tree.map(
+        lambda x, u: x - (learner.learning_rate * u).astype(x.dtype), learner.params, updates
+    )
     params, optimizer_state = jax.tree.map(
         lambda new, old: jnp.where(sound, new, old),
         (stepped, optimizer_state),

@@ -17,7 +17,7 @@ from purerl import normalizer
 from purerl.config import Config, check_divides
 from purerl.env import Env
 from purerl.keys import Purpose, derive, per_environment
-from purerl.learner import in_one_vector, is_recurrent, learn, optimizer
+from purerl.learner import is_recurrent, learn, optimizer
 from purerl.rollout import Finished, Transition, rollout, start_episodes
 from purerl.shards import WHOLE, Shards, gather, total
 from purerl.starts import count_replays
@@ -74,7 +74,7 @@ def init(config: Config, env: Env, network: Network, key: Array) -> TrainState:
     limit = jax.vmap(lambda k: jax.random.randint(k, (), 1, config.episode_length + 1))(limit_keys)
     return TrainState(
         params=params,
-        optimizer=optimizer(config).init(in_one_vector(params)[0]),
+        optimizer=optimizer(config).init(params),
         learning_rate=jnp.asarray(config.learning_rate, jnp.float32),
         normalizer=normalizer.init(jax.tree.map(lambda x: x[0], env_state.observation)),
         reward_normalizer=normalizer.init(jnp.zeros(())),

@@ -99,7 +99,7 @@ class TrainState(struct.PyTreeNode):
 
     # What is learned.
     params: PyTree
-    optimizer: PyTree  # Adam's moments of all parameters, one vector [P] each
+    optimizer: PyTree  # Adam's moments of all parameters
     learning_rate: Array  # [] float32; moves only under the adaptive-KL schedule
     normalizer: PyTree  # normalizer.Statistics of the observation
     reward_normalizer: PyTree  # normalizer.Statistics of the discounted return, [] each

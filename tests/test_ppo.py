@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from purerl import evaluation, learner, networks, normalizer, ppo, slices, targets
+from purerl import compilation, evaluation, learner, networks, normalizer, ppo, slices, targets
 from purerl.env import State
+from purerl.experiment import Evaluation
 from purerl.rollout import rollout
 from purerl.types import count_as_int
 
@@ -561,14 +562,17 @@ def test_segments_count_in_minibatches_and_are_not_for_recurrent_networks():
         setup(config, recurrent=True)
 
 
-def test_parameters_in_one_vector_begin_where_a_gpu_can_read_them():
-    shapes = {"a": (1,), "b": (3, 27), "c": (), "d": (64,), "e": (5, 1)}
-    params = {k: jnp.full(s, i + 1.0) for i, (k, s) in enumerate(shapes.items())}
-    params["b"] = params["b"].astype(jnp.bfloat16)
-    vector, as_tree = learner.in_one_vector(params)
-    starts = [int(np.argmax(np.asarray(vector) == i + 1.0)) for i in range(len(shapes))]
-    assert starts == [0, 64, 192, 256, 320]  # multiples of 128 bytes, whatever the type
-    assert (np.asarray(vector) != 0).sum() == sum(x.size for x in params.values())
-    for old, new in zip(*map(jax.tree.leaves, (params, as_tree(vector))), strict=True):
-        assert old.dtype == new.dtype
-        np.testing.assert_array_equal(old, new)
+@pytest.mark.parametrize("recurrent", [False, True])
+def test_on_a_gpu_an_update_is_two_programs_that_make_the_same(recurrent, monkeypatch):
+    env, network, state = setup(recurrent=recurrent)
+    expected, metrics = UPDATE(CONFIG, env, network, state)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    programs = compilation.compile_programs(CONFIG, env, network, Evaluation(number=0), fresh=False)
+    assert set(programs.seconds) == {"collect", "improve"}
+    updated, seen = programs.update(jax.tree.map(jnp.copy, state))
+    leaves = jax.tree.leaves((seen, updated.params, updated.optimizer, updated.env.physics))
+    originals = jax.tree.leaves(
+        (metrics, expected.params, expected.optimizer, expected.env.physics)
+    )
+    for x, y in zip(leaves, originals, strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5)
