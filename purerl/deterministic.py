@@ -9,7 +9,8 @@ into other code, and a new MJX that adds more scatter-adds is covered without be
 
 A loop that counts up to a small constant (MJX's Newton iterations) becomes a scan that stands still
 once it is done, with the same results: before each round of a `while` a GPU waits for the host,
-which reads the condition, and programs for several devices wait for one another.
+which reads the condition, and programs for several devices wait for one another. And there, small
+linear systems get kernels of their own (`small_systems.py`).
 """
 
 import functools
@@ -21,6 +22,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.extend import core
 
+from purerl import small_systems
 from purerl.folding import (
     CALLS,
     Known,
@@ -109,8 +111,13 @@ def sub_jaxprs(eqn: core.JaxprEqn) -> list[core.ClosedJaxpr]:
     return found
 
 
-def _has_scatter_sum(eqn: core.JaxprEqn) -> bool:
-    return any(list_scatter_sums(sub) for sub in sub_jaxprs(eqn))
+def _is_rewritten(eqn: core.JaxprEqn) -> bool:
+    """Says whether there is a replacement for an equation or for one inside of it."""
+    return (
+        _is_unordered(eqn)
+        or small_systems.wanted(eqn)
+        or any(_is_rewritten(inner) for sub in sub_jaxprs(eqn) for inner in sub.jaxpr.eqns)
+    )
 
 
 def _prune(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
@@ -170,12 +177,16 @@ def _apply(eqn: core.JaxprEqn, inputs: list, known: list[Known], shared: dict) -
     name = eqn.primitive.name
     if _is_unordered(eqn):
         return [ordered_scatter(eqn, inputs, known)]
-    if name != "while" and not _has_scatter_sum(eqn):
+    if small_systems.wanted(eqn):
+        return small_systems.compute(eqn, inputs)
+    if name != "while" and not _is_rewritten(eqn):
         return bind_equation(eqn, inputs)
     if name in CALLS:
         return _evaluate(called_jaxpr(eqn), known, shared, *inputs)
     if name in _LOOPS:
         return list(_LOOPS[name](eqn.params, inputs, known, shared))
+    if not any(list_scatter_sums(sub) for sub in sub_jaxprs(eqn)):
+        return bind_equation(eqn, inputs)
     raise RuntimeError(
         f"A sum without a fixed order stands inside {name!r}, which cannot be rewritten."
     )
