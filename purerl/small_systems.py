@@ -9,21 +9,16 @@ A warp works on [m, m], m the next power of 2, of a matrix [n, n]; beyond n it r
 """
 
 import functools
+import importlib.util
 from collections.abc import Callable
 from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.experimental import pallas
 from jax.extend import core
 
 from purerl.types import Array
-
-try:
-    from jax.experimental.pallas import triton
-except ImportError:  # JAX means to remove it; then the library's kernels are used
-    triton = None  # type: ignore[assignment]
 
 # Rows. A factor and two solves of 4,096 systems, here and by the library: of 14 rows 57 and 107
 # microseconds; of 27 rows 381 and 192 (H100).
@@ -31,14 +26,16 @@ LARGEST = 16
 
 
 def on_gpu() -> bool:
-    """Tells whether programs are for a GPU."""
-    return jax.default_backend() == "gpu"
+    """Tells whether programs are for a GPU, and JAX still has Triton's part of Pallas."""
+    # JAX means to remove it; then the library's kernels are used.
+    there = jax.default_backend() == "gpu"
+    return there and importlib.util.find_spec("jax.experimental.pallas.triton") is not None
 
 
 def wanted(eqn: core.JaxprEqn) -> bool:
     """Tells whether an equation is a factorisation or a solve to be computed by these kernels."""
     name = eqn.primitive.name
-    if name not in ("cholesky", "triangular_solve") or not on_gpu() or triton is None:
+    if name not in ("cholesky", "triangular_solve") or not on_gpu():
         return False
     matrix, *sides = [cast(Any, v.aval) for v in eqn.invars]
     small = matrix.ndim == 2 and matrix.shape[0] <= LARGEST and matrix.dtype == jnp.float32
@@ -81,6 +78,10 @@ def triangular_solve(matrix: Array, side: Array, *, lower: bool, transposed: boo
 
 def _call(kernel: Callable, shape: tuple[int, ...], *inputs: Array) -> Array:
     """Runs a kernel on one system; of many, by vmap, a warp takes each."""
+    # Imported here: it takes 0.1 s, of which a run on CPUs need not wait.
+    from jax.experimental import pallas
+    from jax.experimental.pallas import triton
+
     padded = (pallas.next_power_of_2(shape[0]),) * len(shape)
     found = pallas.pallas_call(
         kernel,
