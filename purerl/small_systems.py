@@ -5,7 +5,8 @@ step. JAX hands that to cuSOLVER and cuBLAS: four launches each, for pointers an
 CUDA graphs. Of an ant's physics step of 0.50 ms they were 0.19. These kernels, written in Pallas,
 take a matrix for each warp, which keeps it in registers (measured: `docs/gpu.md`).
 
-A warp works on [m, m], m the next power of 2, of a matrix [n, n]; beyond n it reads an identity.
+A warp works on [m, m], m the next power of 2 from 4 on, of a matrix [n, n]; beyond n it reads an
+identity.
 """
 
 import functools
@@ -82,7 +83,7 @@ def _call(kernel: Callable, shape: tuple[int, ...], *inputs: Array) -> Array:
     from jax.experimental import pallas
     from jax.experimental.pallas import triton
 
-    padded = (pallas.next_power_of_2(shape[0]),) * len(shape)
+    padded = (max(4, pallas.next_power_of_2(shape[0])),) * len(shape)
     found = pallas.pallas_call(
         kernel,
         jax.ShapeDtypeStruct(padded, jnp.float32),
