@@ -26,17 +26,19 @@ from purerl.types import Array
 LARGEST = 16
 
 
-def on_gpu() -> bool:
-    """Tells whether programs are for a GPU, and JAX still has Triton's part of Pallas."""
-    # JAX means to remove it; then the library's kernels are used.
-    there = jax.default_backend() == "gpu"
-    return there and importlib.util.find_spec("jax.experimental.pallas.triton") is not None
+def can_run() -> bool:
+    """Tells whether programs are for a GPU, and JAX has Triton's part of Pallas.
+
+    JAX means to remove it; then the library's kernels are used.
+    """
+    on_gpu = jax.default_backend() == "gpu"
+    return on_gpu and importlib.util.find_spec("jax.experimental.pallas.triton") is not None
 
 
 def wanted(eqn: core.JaxprEqn) -> bool:
     """Tells whether an equation is a factorisation or a solve to be computed by these kernels."""
     name = eqn.primitive.name
-    if name not in ("cholesky", "triangular_solve") or not on_gpu():
+    if name not in ("cholesky", "triangular_solve") or not can_run():
         return False
     matrix, *sides = [cast(Any, v.aval) for v in eqn.invars]
     small = matrix.ndim == 2 and matrix.shape[0] <= LARGEST and matrix.dtype == jnp.float32
@@ -50,10 +52,9 @@ def compute(eqn: core.JaxprEqn, inputs: list[Array]) -> list[Array]:
     """Computes an equation that is `wanted`."""
     if eqn.primitive.name == "cholesky":
         return [cholesky(*inputs)]
-    matrix, side = inputs
-    # conjugate_a changes nothing of real numbers.
-    halves = {"lower": eqn.params["lower"], "transposed": eqn.params["transpose_a"]}
-    return [triangular_solve(matrix, side[:, 0], **halves)[:, None]]
+    (matrix, side), p = inputs, eqn.params  # conjugate_a changes nothing of real numbers
+    found = triangular_solve(matrix, side[:, 0], lower=p["lower"], transposed=p["transpose_a"])
+    return [found[:, None]]
 
 
 def cholesky(matrix: Array) -> Array:

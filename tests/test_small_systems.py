@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import jaxpr_as_fun
 
 from purerl import small_systems
 from purerl.deterministic import trace_deterministic
@@ -67,10 +68,10 @@ def test_on_a_gpu_the_trace_of_small_systems_has_their_kernels(function, monkeyp
     sizes = jnp.zeros((7, 7)), jnp.zeros(7)
     plain = str(trace_deterministic(function, *sizes))
     assert "cholesky" in plain and "pallas_call" not in plain
-    monkeypatch.setattr(small_systems, "on_gpu", lambda: True)
+    monkeypatch.setattr(small_systems, "can_run", lambda: True)
     traced = trace_deterministic(function, *sizes)
     assert "pallas_call" in str(traced) and "cholesky" not in str(traced.jaxpr.eqns)
-    run = jax.vmap(jax.extend.core.jaxpr_as_fun(traced))
+    run = jax.vmap(jaxpr_as_fun(traced))
     matrices = np.stack([positive_matrix(7, seed) for seed in range(3)])
     sides = np.random.default_rng(1).normal(size=(3, 7)).astype(np.float32)
     (found,) = run(matrices, sides)
@@ -86,14 +87,28 @@ def test_on_a_gpu_the_trace_of_small_systems_has_their_kernels(function, monkeyp
     ],
 )
 def test_larger_systems_are_left_to_the_library(function, shapes, monkeypatch):
-    monkeypatch.setattr(small_systems, "on_gpu", lambda: True)
+    monkeypatch.setattr(small_systems, "can_run", lambda: True)
     assert "pallas_call" not in str(trace_deterministic(function, *map(jnp.zeros, shapes)))
 
 
 def test_several_right_hand_sides_are_left_to_the_library(monkeypatch):
-    monkeypatch.setattr(small_systems, "on_gpu", lambda: True)
+    monkeypatch.setattr(small_systems, "can_run", lambda: True)
     traced = trace_deterministic(
         lambda a, b: jax.lax.linalg.triangular_solve(a, b, left_side=True, lower=True),
         jnp.zeros((4, 4)), jnp.zeros((4, 2)),
     )  # fmt: skip
     assert "pallas_call" not in str(traced)
+
+
+def test_a_system_inside_of_what_cannot_be_rewritten_is_left_to_the_library(monkeypatch):
+    def function(matrix, side):
+        return jax.lax.custom_linear_solve(
+            lambda x: matrix @ x, side, lambda _, b: solve(matrix, b), symmetric=True
+        )
+
+    monkeypatch.setattr(small_systems, "can_run", lambda: True)
+    matrix, side = positive_matrix(4), np.ones(4, np.float32)
+    traced = trace_deterministic(function, matrix, side)
+    assert "cholesky" in str(traced)
+    (found,) = jaxpr_as_fun(traced)(matrix, side)
+    assert close(found, np.linalg.solve(matrix.astype(np.float64), side))
