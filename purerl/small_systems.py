@@ -10,7 +10,6 @@ identity.
 """
 
 import functools
-import importlib.util
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -19,26 +18,18 @@ import jax.numpy as jnp
 from jax import lax
 from jax.extend import core
 
+from purerl import own_kernels
 from purerl.types import Array
 
-# Rows. A factor and two solves of 4,096 systems, here and by the library: of 14 rows 57 and 107
-# microseconds; of 27 rows 381 and 192 (H100).
-LARGEST = 16
-
-
-def can_run() -> bool:
-    """Tells whether programs are for a GPU, and JAX has Triton's part of Pallas.
-
-    JAX means to remove it; then the library's kernels are used.
-    """
-    on_gpu = jax.default_backend() == "gpu"
-    return on_gpu and importlib.util.find_spec("jax.experimental.pallas.triton") is not None
+# Rows: a warp has registers for no more. A factor and two solves of 4,096 systems, here and by the
+# library: of 14 rows 31 and 86 microseconds; of 27 rows 75 and 170 (H100).
+LARGEST = 32
 
 
 def wanted(eqn: core.JaxprEqn) -> bool:
     """Tells whether an equation is a factorisation or a solve to be computed by these kernels."""
     name = eqn.primitive.name
-    if name not in ("cholesky", "triangular_solve") or not can_run():
+    if name not in ("cholesky", "triangular_solve") or not own_kernels.can_run():
         return False
     matrix, *sides = [cast(Any, v.aval) for v in eqn.invars]
     small = matrix.ndim == 2 and matrix.shape[0] <= LARGEST and matrix.dtype == jnp.float32
@@ -79,19 +70,10 @@ def triangular_solve(matrix: Array, side: Array, *, lower: bool, transposed: boo
 
 
 def _call(kernel: Callable, shape: tuple[int, ...], *inputs: Array) -> Array:
-    """Runs a kernel on one system; of many, by vmap, a warp takes each."""
-    # Imported here: it takes 0.1 s, of which a run on CPUs need not wait.
-    from jax.experimental import pallas
-    from jax.experimental.pallas import triton
-
-    padded = (max(4, pallas.next_power_of_2(shape[0])),) * len(shape)
-    found = pallas.pallas_call(
-        kernel,
-        jax.ShapeDtypeStruct(padded, jnp.float32),
-        compiler_params=triton.CompilerParams(num_warps=1),
-        interpret=jax.default_backend() == "cpu",
-    )(*inputs)
-    return found[tuple(map(slice, shape))]
+    """Runs a kernel on one system; it is told m."""
+    m = max(4, 1 << (shape[0] - 1).bit_length())
+    result = jax.ShapeDtypeStruct(shape, jnp.float32)
+    return own_kernels.call(functools.partial(kernel, m), [result], *inputs)[0]
 
 
 def _places(m: int) -> tuple[Array, Array]:
@@ -107,43 +89,51 @@ def _read(ref: Any, row: Array, col: Array) -> Array:
     return jnp.where((row < n) & (col < n), values, jnp.where(row == col, 1.0, 0.0))
 
 
-def _cholesky_kernel(matrix_ref: Any, factor_ref: Any) -> None:
+def _write(ref: Any, values: Array, *place: Array) -> None:
+    """Writes the entries that are within."""
+    from jax.experimental.pallas import triton
+
+    inside = functools.reduce(jnp.logical_and, [x < ref.shape[0] for x in place])
+    triton.store(ref.at[place], values, mask=inside)
+
+
+def _cholesky_kernel(m: int, matrix_ref: Any, factor_ref: Any) -> None:
     """Makes column k of L, and takes its products from the entries to the right, for all k."""
-    row, col = _places(factor_ref.shape[0])
+    row, col = _places(m)
+    number = lax.iota(jnp.int32, m)
 
     def step(k: Array, a: Array) -> Array:
-        # What is left is symmetric: a column is read as a row too, which lies across the threads.
-        down = jnp.sum(jnp.where(col == k, a, 0.0), axis=1)
-        across = jnp.sum(jnp.where(row == k, a, 0.0), axis=0)
-        pivot = jnp.sum(jnp.where((row == k) & (col == k), a, 0.0))
-        root = jnp.where(pivot > 0.0, jnp.sqrt(pivot), jnp.nan)
-        down, across = down / root, across / root
-        rest = jnp.where((row > k) & (col > k), a - down[:, None] * across[None, :], a)
-        return jnp.where((row >= k) & (col == k), down[:, None], rest)
+        # What is left is symmetric: a column is read as a row, whose sum is within a thread.
+        column = jnp.sum(jnp.where(row == k, a, 0.0), axis=0)
+        pivot = jnp.sum(jnp.where(number == k, column, 0.0))
+        column = column / jnp.where(pivot > 0.0, jnp.sqrt(pivot), jnp.nan)
+        down, across = column[:, None], column[None, :]
+        rest = jnp.where((row > k) & (col > k), a - down * across, a)
+        return jnp.where((row >= k) & (col == k), down, rest)
 
     a = _read(matrix_ref, jnp.maximum(row, col), jnp.minimum(row, col))
     a = lax.fori_loop(0, matrix_ref.shape[0], step, a)
-    factor_ref[...] = jnp.where(row >= col, a, 0.0)
+    _write(factor_ref, jnp.where(row >= col, a, 0.0), row, col)
 
 
 def _solve_kernel(
-    lower: bool, transposed: bool, matrix_ref: Any, side_ref: Any, solution_ref: Any
+    lower: bool, transposed: bool, m: int, matrix_ref: Any, side_ref: Any, solution_ref: Any
 ) -> None:
     """Solves for x[k] and takes its products from the equations still to solve, for all k."""
-    n, m = matrix_ref.shape[0], solution_ref.shape[0]
+    n = matrix_ref.shape[0]
     number = lax.iota(jnp.int32, m)
     row, col = _places(m)
-    a = _read(matrix_ref, row, col)
-    along, axis = (row, 0) if transposed else (col, 1)
+    # Row k of what is read holds the coefficients of x[k]: their sum is within a thread.
+    a = _read(matrix_ref, row, col) if transposed else _read(matrix_ref, col, row)
     forward = lower != transposed
 
     def step(i: Array, x: Array) -> Array:
         k = i if forward else n - 1 - i
-        column = jnp.sum(jnp.where(along == k, a, 0.0), axis=axis)
+        column = jnp.sum(jnp.where(row == k, a, 0.0), axis=0)
         found = jnp.sum(jnp.where(number == k, x, 0.0))
         found = found / jnp.sum(jnp.where(number == k, column, 0.0))
         left = number > k if forward else number < k
         return jnp.where(number == k, found, jnp.where(left, x - column * found, x))
 
     x = jnp.where(number < n, side_ref[jnp.minimum(number, n - 1)], 0.0)
-    solution_ref[...] = lax.fori_loop(0, n, step, x)
+    _write(solution_ref, lax.fori_loop(0, n, step, x), number)

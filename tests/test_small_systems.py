@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxpr_as_fun
 
-from purerl import small_systems
+from purerl import own_kernels, small_systems
 from purerl.deterministic import trace_deterministic
 
-SIZES = (1, 2, 5, 14, 27)
+SIZES = (1, 2, 5, 14, 27, 32)
 
 
 def positive_matrix(n, seed=0):
@@ -68,7 +68,7 @@ def test_on_a_gpu_the_trace_of_small_systems_has_their_kernels(function, monkeyp
     sizes = jnp.zeros((7, 7)), jnp.zeros(7)
     plain = str(trace_deterministic(function, *sizes))
     assert "cholesky" in plain and "pallas_call" not in plain
-    monkeypatch.setattr(small_systems, "can_run", lambda: True)
+    monkeypatch.setattr(own_kernels, "can_run", lambda: True)
     traced = trace_deterministic(function, *sizes)
     assert "pallas_call" in str(traced) and "cholesky" not in str(traced.jaxpr.eqns)
     run = jax.vmap(jaxpr_as_fun(traced))
@@ -87,12 +87,12 @@ def test_on_a_gpu_the_trace_of_small_systems_has_their_kernels(function, monkeyp
     ],
 )
 def test_larger_systems_are_left_to_the_library(function, shapes, monkeypatch):
-    monkeypatch.setattr(small_systems, "can_run", lambda: True)
+    monkeypatch.setattr(own_kernels, "can_run", lambda: True)
     assert "pallas_call" not in str(trace_deterministic(function, *map(jnp.zeros, shapes)))
 
 
 def test_several_right_hand_sides_are_left_to_the_library(monkeypatch):
-    monkeypatch.setattr(small_systems, "can_run", lambda: True)
+    monkeypatch.setattr(own_kernels, "can_run", lambda: True)
     traced = trace_deterministic(
         lambda a, b: jax.lax.linalg.triangular_solve(a, b, left_side=True, lower=True),
         jnp.zeros((4, 4)), jnp.zeros((4, 2)),
@@ -106,7 +106,7 @@ def test_a_system_inside_of_what_cannot_be_rewritten_is_left_to_the_library(monk
             lambda x: matrix @ x, side, lambda _, b: solve(matrix, b), symmetric=True
         )
 
-    monkeypatch.setattr(small_systems, "can_run", lambda: True)
+    monkeypatch.setattr(own_kernels, "can_run", lambda: True)
     matrix, side = positive_matrix(4), np.ones(4, np.float32)
     traced = trace_deterministic(function, matrix, side)
     assert "cholesky" in str(traced)
