@@ -9,8 +9,11 @@ into other code, and a new MJX that adds more scatter-adds is covered without be
 
 A loop that counts up to a small constant (MJX's Newton iterations) becomes a scan that stands still
 once it is done, with the same results: before each round of a `while` a GPU waits for the host,
-which reads the condition, and programs for several devices wait for one another. And there, small
-linear systems get kernels of their own (`small_systems.py`).
+which reads the condition, and programs for several devices wait for one another.
+
+For a GPU, where a kernel takes microseconds however little it does, there are fewer of them: small
+linear systems have one each (`small_systems.py`), what is put at constant indices is gathered, and
+rounds of innermost loops are written out.
 """
 
 import functools
@@ -32,12 +35,10 @@ from purerl.folding import (
     known_constant,
     known_literal,
 )
-from purerl.ordered_sums import ordered_scatter, source
+from purerl.loops import MOST_ROUNDS, WRITTEN_OUT, has_loop, is_innermost, rounds, sub_jaxprs
+from purerl.ordered_sums import gathered_scatter, ordered_scatter, source
 from purerl.types import Array, PyTree
 
-# A scan makes all its rounds. Beyond so many, the loop most likely ends far earlier: MuJoCo's
-# default is 100 iterations, of which a cartpole needs two.
-MOST_ROUNDS = 16
 _SUMS = ("scatter-add", "scatter_add", "scatter-mul", "scatter_mul", "scatter-sub", "scatter_sub")
 
 
@@ -99,16 +100,9 @@ def _is_unordered(eqn: core.JaxprEqn) -> bool:
     return sums and jnp.issubdtype(eqn.invars[0].aval.dtype, jnp.inexact)
 
 
-def sub_jaxprs(eqn: core.JaxprEqn) -> list[core.ClosedJaxpr]:
-    """Returns the traces inside one equation (loop bodies, branches, called functions)."""
-    found = []
-    for value in eqn.params.values():
-        for item in value if isinstance(value, tuple | list) else (value,):
-            if isinstance(item, core.ClosedJaxpr):
-                found.append(item)
-            elif isinstance(item, core.Jaxpr):
-                found.append(core.ClosedJaxpr(item, ()))
-    return found
+def for_gpu() -> bool:
+    """Tells whether what is traced will run on a GPU."""
+    return jax.default_backend() == "gpu"
 
 
 def _is_rewritten(eqn: core.JaxprEqn) -> bool:
@@ -116,6 +110,7 @@ def _is_rewritten(eqn: core.JaxprEqn) -> bool:
     return (
         _is_unordered(eqn)
         or small_systems.wanted(eqn)
+        or (for_gpu() and (eqn.primitive.name == "scatter" or is_innermost(eqn)))
         or any(_is_rewritten(inner) for sub in sub_jaxprs(eqn) for inner in sub.jaxpr.eqns)
     )
 
@@ -181,6 +176,8 @@ def _apply(eqn: core.JaxprEqn, inputs: list, known: list[Known], shared: dict) -
         return small_systems.compute(eqn, inputs)
     if name != "while" and not _is_rewritten(eqn):
         return bind_equation(eqn, inputs)
+    if name == "scatter" and known[1] is not None:
+        return [gathered_scatter(eqn, inputs, known)]
     if name in CALLS:
         return _evaluate(called_jaxpr(eqn), known, shared, *inputs)
     if name in _LOOPS:
@@ -202,8 +199,11 @@ def _scan(params: dict, inputs: list, known: list[Known], shared: dict) -> list:
         return out[:m], out[m:]
 
     carry, xs = list(inputs[n : n + m]), list(inputs[n + m :])
+    unroll = params["unroll"]
+    if for_gpu() and not has_loop(body):
+        unroll = max(unroll, min(WRITTEN_OUT, params["length"]))
     carry, ys = lax.scan(
-        step, carry, xs, params["length"], reverse=params["reverse"], unroll=params["unroll"]
+        step, carry, xs, params["length"], reverse=params["reverse"], unroll=unroll
     )
     return [*carry, *ys]
 
@@ -239,48 +239,6 @@ def _while(params: dict, inputs: list, known: list[Known], shared: dict) -> list
 
     carry = [jnp.asarray(x, v.aval.dtype) for x, v in zip(carry, body.jaxpr.outvars, strict=True)]
     return lax.scan(step_unless_done, carry, None, limit)[0]
-
-
-def rounds(params: dict, known: list[Known]) -> int | None:
-    """Returns the most rounds of a `while` that counts to a constant, None of any other.
-
-    Its condition fails when a counter reaches a literal, whatever else ends it earlier, and each
-    round adds 1 to the counter.
-    """
-    n, m = params["cond_nconsts"], params["body_nconsts"]
-    test, body = params["cond_jaxpr"].jaxpr, params["body_jaxpr"].jaxpr
-    for counter, limit in _limits(test):
-        place = test.invars.index(counter) - n if counter in test.invars else -1
-        if place < 0 or known[n + m + place] is None:
-            continue
-        steps = [e for e in body.eqns if body.outvars[place] in e.outvars]
-        if steps and steps[0].primitive.name == "add" and _is_plus_one(steps[0], body, m + place):
-            return max(0, limit - int(known[n + m + place]()))
-    return None
-
-
-def _limits(test: core.Jaxpr) -> list[tuple[core.Var | core.Literal, int]]:
-    """Returns each (variable, literal) for which variable >= literal alone makes `test` false."""
-    made_by = {v: e for e in test.eqns for v in e.outvars}
-    first = made_by.get(test.outvars[0])
-    if first is None or first.primitive.name != "not":
-        return []
-    ends, found = [first.invars[0]], []
-    while ends:
-        eqn = None if isinstance(ends[-1], core.Literal) else made_by.get(ends[-1])
-        ends.pop()
-        if eqn is None:
-            continue
-        if eqn.primitive.name in ("or", "convert_element_type"):
-            ends += eqn.invars
-        elif eqn.primitive.name == "ge" and isinstance(eqn.invars[1], core.Literal):
-            found.append((eqn.invars[0], int(eqn.invars[1].val)))
-    return found
-
-
-def _is_plus_one(eqn: core.JaxprEqn, body: core.Jaxpr, place: int) -> bool:
-    number, one = eqn.invars
-    return number is body.invars[place] and isinstance(one, core.Literal) and int(one.val) == 1
 
 
 def _cond(params: dict, inputs: list, known: list[Known], shared: dict) -> list:

@@ -1,4 +1,4 @@
-"""A scatter-add with constant indices as gathers whose sums have a fixed order."""
+"""Scatters with constant indices as gathers; a scatter-add's sums have a fixed order."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -39,6 +39,22 @@ def ordered_scatter(eqn: core.JaxprEqn, inputs: list, known: list[Known]) -> Arr
     place = np.arange(operand.size)
     place[touched] = operand.size + np.arange(len(touched))
     return jnp.reshape(_take(jnp.concatenate([whole, total]), place), operand.shape)
+
+
+def gathered_scatter(eqn: core.JaxprEqn, inputs: list, known: list[Known]) -> Array:
+    """A scatter that puts updates in their places, the last where several meet, as one gather.
+
+    XLA has two kernels for a scatter, one of them a copy, and neither is fused with others.
+    """
+    operand, _, updates = inputs
+    addresses = _addresses(eqn, np.asarray(known[1]()))
+    kept = np.flatnonzero(addresses >= 0)
+    if not kept.size:
+        return operand
+    place = np.full(operand.size, -1)
+    place[addresses[kept]] = kept
+    put = jnp.reshape(_take(jnp.reshape(updates, (-1,)), np.maximum(place, 0)), operand.shape)
+    return jnp.where(np.reshape(place >= 0, operand.shape), put, operand)
 
 
 def _take(flat: Array, index: np.ndarray) -> Array:

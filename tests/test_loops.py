@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from purerl.deterministic import sub_jaxprs, trace_deterministic
+from purerl.deterministic import trace_deterministic
+from purerl.loops import sub_jaxprs
 
 LIMIT = 5
 

@@ -14,7 +14,8 @@ from dm_control import suite
 
 from envs import run
 from purerl import model as lookup
-from purerl.deterministic import list_scatter_sums, sub_jaxprs, trace_deterministic
+from purerl.deterministic import list_scatter_sums, trace_deterministic
+from purerl.loops import sub_jaxprs
 from purerl.physics import CHANGEABLE_FIELDS, READINGS, Physics, choose_engine
 
 # Two legs that touch a floor, a ball, a tendon, a filtered motor, a mocap body and sensors.

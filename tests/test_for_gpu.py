@@ -1,0 +1,95 @@
+"""What is rewritten for a GPU alone, run on a CPU: scatters as gathers, loops written out."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.extend.core import jaxpr_as_fun
+
+from purerl import deterministic
+from purerl.deterministic import trace_deterministic
+from purerl.loops import WRITTEN_OUT, sub_jaxprs
+from purerl.physics import Physics
+from tests.test_physics import NUMBER, biped, trajectory
+
+
+@pytest.fixture(autouse=True)
+def _for_gpu(monkeypatch):
+    monkeypatch.setattr(deterministic, "for_gpu", lambda: True)
+
+
+def equations(closed):
+    """Returns all equations of a trace, at any depth."""
+    inner = [e for eqn in closed.jaxpr.eqns for sub in sub_jaxprs(eqn) for e in equations(sub)]
+    return [*closed.jaxpr.eqns, *inner]
+
+
+def named(closed, name):
+    return [eqn for eqn in equations(closed) if eqn.primitive.name == name]
+
+
+INDEX = np.array([2, 0, 2, 7, -9])
+SCATTERS = {
+    "places that meet and one that is not there": lambda x: jnp.arange(5.0).at[INDEX].set(x[:5]),
+    "one clipped": lambda x: jnp.zeros(5).at[np.array([1, 9])].set(x[:2], mode="clip"),
+    "none that is there": lambda x: jnp.arange(3.0).at[np.array([7])].set(x[:1], mode="drop"),
+    "a column": lambda x: jnp.ones((4, 3)).at[:, 1].set(x[:4]),
+    "a block": lambda x: jnp.ones((4, 3)).at[1:3, :2].set(x[:4].reshape(2, 2)),
+    "a diagonal": lambda x: jnp.ones((4, 4)).at[np.arange(4), np.arange(4)].set(x[:4]),
+    "all": lambda x: jnp.zeros(8).at[np.arange(8)[::-1]].set(x),
+    "rows of whole numbers": lambda x: (
+        jnp.zeros((3, 8), jnp.int32).at[np.array([2, 0])].set((x * 9).astype(jnp.int32))
+    ),
+    "in a loop": lambda x: jax.lax.fori_loop(
+        0, 20, lambda i, c: c.at[np.array([0, 3])].set(c[np.array([3, 0])] + i), x
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SCATTERS)
+def test_what_is_put_at_known_places_is_gathered(name):
+    function = SCATTERS[name]
+    x = jax.random.uniform(jax.random.key(0), (2, 8))
+    closed = trace_deterministic(function, x[0])
+    assert named(jax.make_jaxpr(function)(x[0]), "scatter"), "nothing to show"
+    assert not named(closed, "scatter")
+    (got,) = jax.vmap(jaxpr_as_fun(closed))(x)
+    want = jnp.stack([function(row) for row in x])
+    assert got.dtype == want.dtype
+    np.testing.assert_array_equal(got, want)
+
+
+def test_what_is_put_at_places_known_only_later_stays():
+    closed = trace_deterministic(lambda x, i: x.at[i].set(7.0), jnp.zeros(3), jnp.arange(2))
+    assert named(closed, "scatter")
+    np.testing.assert_array_equal(jaxpr_as_fun(closed)(jnp.zeros(3), jnp.arange(2))[0], [7, 7, 0])
+
+
+@pytest.mark.parametrize("length", [2, WRITTEN_OUT, WRITTEN_OUT + 3])
+def test_only_the_innermost_of_loops_is_written_out(length):
+    def inner(x):
+        return jax.lax.scan(lambda c, y: (c * y + 1.0, c), x[0], x[:length])
+
+    def nested(x):
+        return jax.lax.scan(lambda c, _: (inner(c * x)[1].sum(), c), x[0], None, 5)
+
+    x = jax.random.uniform(jax.random.key(0), (2, 8))
+    closed = trace_deterministic(nested, x[0])
+    assert [eqn.params["unroll"] for eqn in named(closed, "scan")] == [1, min(length, WRITTEN_OUT)]
+    for got, want in zip(jax.vmap(jaxpr_as_fun(closed))(x), jax.vmap(nested)(x), strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-6)
+
+
+def test_a_physics_step_for_a_gpu_is_the_same_step():
+    p = Physics(biped(), ("xpos", "cvel"), substeps=2, engine="jax")
+    state = jax.tree.map(lambda x: x[-1], trajectory("c")[1])
+    ctrl = jnp.full((NUMBER, 2), 0.5)
+    one = jax.tree.map(lambda x: x[0], (state, ctrl))
+    traced = p._engine.trace(*one, {})
+    assert not named(traced, "scatter")
+    assert any(eqn.params["unroll"] > 1 for eqn in named(traced, "scan"))
+    found = jax.jit(jax.vmap(p.step))(state, ctrl)
+    plain = jax.jit(jax.vmap(lambda s, u: p._engine._step(s, u, {})))(state, ctrl)
+    for x, y in zip(jax.tree.leaves(found), plain, strict=True):
+        scale = max(1.0, float(jnp.abs(y).max(initial=0.0)))
+        np.testing.assert_allclose(x / scale, y / scale, atol=1e-5)
