@@ -8,10 +8,6 @@ reductions it is the other way round: XLA's own are slow untimed, and it takes T
 told to (a humanoid's physics faster by 9%, that of ants over gaps by 12%; ants on a floor, rodents
 and the learner alike).
 
-A program of several devices is simplified once more than one of one, before it is partitioned, and
-its sums come out in other shapes and orders: a cart-pole's gradient differed in the seventh digit
-on two GPUs. Without that pass it has the same bits on one and two.
-
 Most kernels are small, in a CUDA graph, and one after another unless XLA is told to let those run
 together that need nothing of each other. It changes no bit: `docs/gpu.md`.
 """
@@ -19,12 +15,11 @@ together that need nothing of each other. It changes no bit: `docs/gpu.md`.
 import os
 
 LEVEL = "xla_gpu_autotune_level"
-# In the place of what timing would have found out; the last for programs of several devices.
+# In the place of what timing would have found out.
 RULES = {
     LEVEL: "0",
     "xla_gpu_enable_triton_gemm": "false",
     "xla_gpu_experimental_enable_fusion_block_level_rewriter": "true",
-    "xla_disable_hlo_passes": "spmd-simplify",
 }
 GRAPHS = {
     "xla_gpu_command_buffer_scheduling_mode": "CONCURRENT",

@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
+from purerl import own_kernels
 from purerl.config import check_divides
-from purerl.deterministic import sub_jaxprs
+from purerl.loops import has_loop
 from purerl.types import Array, PyTree
 
 AXIS = "devices"
@@ -70,14 +71,6 @@ def each(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
     return jax.tree.unflatten(jax.tree.structure(shapes), jax.lax.map(alone, parts))
 
 
-def has_loop(closed: core.ClosedJaxpr) -> bool:
-    """Tells whether a trace loops, at any depth."""
-    return any(
-        eqn.primitive.name in ("scan", "while") or any(map(has_loop, sub_jaxprs(eqn)))
-        for eqn in closed.jaxpr.eqns
-    )
-
-
 def in_branch(compute: Callable, *leaves: Array) -> list[Array]:
     """Calls `compute` in a branch, of which XLA does not know that it is the one always taken.
 
@@ -98,18 +91,28 @@ def set_apart(tree: PyTree) -> PyTree:
     """Returns arrays as they are, by a way on which XLA neither fuses nor simplifies anything.
 
     What it fuses with a sum decides in which order it adds, and it drops barriers before it fuses.
-    It keeps a loop, but where it knows of one trip: here are two, which undo each other. All is one
-    row meanwhile, since XLA chooses a table's layout for those who make and who read it.
+    All is one row meanwhile, since XLA chooses a table's layout for those who make and who read it.
     """
+    leaves, structure = jax.tree.flatten(tree)
+    rows = [jnp.ravel(leaf) for leaf in leaves if leaf.size]
+    passed = iter(through_kernel(rows) if own_kernels.can_run() else through_loop(rows))
+    apart = [next(passed).reshape(leaf.shape) if leaf.size else leaf for leaf in leaves]
+    return jax.tree.unflatten(structure, apart)
+
+
+def through_kernel(rows: list[Array]) -> list[Array]:
+    """Passes arrays through a kernel that does nothing, of which XLA does not know that."""
+    results = [jax.ShapeDtypeStruct(row.shape, row.dtype) for row in rows]
+    return own_kernels.call(lambda *references: None, results, *rows, in_place=True)
+
+
+def through_loop(rows: list[Array]) -> list[Array]:
+    """Passes arrays through a loop. XLA keeps one of two rounds; here they undo each other."""
 
     def flip(x: Array) -> Array:
         return -x if jnp.issubdtype(x.dtype, jnp.floating) else ~x
 
-    leaves, structure = jax.tree.flatten(tree)
-    rows = [jnp.ravel(leaf) for leaf in leaves]
-    rows = jax.lax.fori_loop(0, 2, lambda _, rows: [flip(row) for row in rows], rows)
-    pairs = zip(rows, leaves, strict=True)
-    return jax.tree.unflatten(structure, [row.reshape(jnp.shape(leaf)) for row, leaf in pairs])
+    return jax.lax.fori_loop(0, 2, lambda _, rows: [flip(row) for row in rows], rows)
 
 
 def move(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
@@ -130,9 +133,13 @@ def from_all(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
 
 
 def gather(shards: Shards, parts: PyTree) -> PyTree:
-    """Returns what all shards have [V, ...], from this device's [v, ...]; one message a dtype."""
+    """Returns what all shards have [V, ...], from this device's [v, ...]; one message a dtype.
+
+    Set apart, since on several devices it comes in one row: XLA computed a gradient's norm from
+    slices of that row by other kernels than from arrays, and in 800 steps one differed.
+    """
     if shards.devices == 1:
-        return parts
+        return set_apart(parts)
     leaves, structure = jax.tree.flatten(parts)
     gathered: list[Array] = [jnp.empty(0)] * len(leaves)
     for dtype in dict.fromkeys(leaf.dtype for leaf in leaves):
@@ -142,7 +149,7 @@ def gather(shards: Shards, parts: PyTree) -> PyTree:
         ends = np.cumsum([row.shape[1] for row in rows])
         for i, columns in zip(places, jnp.split(everyone, ends[:-1], axis=1), strict=True):
             gathered[i] = columns.reshape(shards.number, *leaves[i].shape[1:])
-    return jax.tree.unflatten(structure, gathered)
+    return set_apart(jax.tree.unflatten(structure, gathered))
 
 
 def add_in_order(x: Array) -> Array:

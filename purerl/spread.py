@@ -30,6 +30,9 @@ from purerl.types import Array, Metrics, Network, PyTree, TrainState
 PLACES = ("env", "carry", "episode", "discounted_return")  # fields of TrainState that are [B, ...]
 SAME = PartitionSpec()  # a copy on every device
 SPLIT = PartitionSpec(AXIS)
+# Passes that change bits with the number of devices. The first is run for several alone, and makes
+# other sums; the second puts products together that share a factor, in an order that is arbitrary.
+NO_PASSES = {"xla_disable_hlo_passes": "spmd-simplify,dot-merger"}
 
 
 class Spread(NamedTuple):
@@ -204,7 +207,8 @@ def compile_programs(
         jax.shard_map(
             functools.partial(ppo.improve, config, network, shards=shards),
             mesh=layout.mesh, in_specs=(SAME, SPLIT), out_specs=SAME, check_vma=False,
-        )
+        ),
+        compiler_options=NO_PASSES,
     )  # fmt: skip
     whole = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct((shards.number, *x.shape[1:]), x.dtype), experience

@@ -81,10 +81,7 @@ def test_a_manifest_says_whether_the_run_is_exact_and_what_prevents_it(monkeypat
 
 
 GRAPHS = "--xla_gpu_command_buffer_scheduling_mode=CONCURRENT --xla_gpu_graph_min_graph_size=1"
-RULES = (
-    "--xla_gpu_experimental_enable_fusion_block_level_rewriter=true "
-    "--xla_disable_hlo_passes=spmd-simplify"
-)
+RULES = "--xla_gpu_experimental_enable_fusion_block_level_rewriter=true"
 UNTIMED = f"--xla_gpu_autotune_level=0 --xla_gpu_enable_triton_gemm=false {RULES}"
 FIXED = f"{GRAPHS} {UNTIMED}"
 OWN_GRAPHS = "--xla_gpu_command_buffer_scheduling_mode=LHS --xla_gpu_graph_min_graph_size=5"

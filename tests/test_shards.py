@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from purerl import checkpoint, normalizer, shards
+from purerl import checkpoint, normalizer, own_kernels, shards
 from purerl.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
 from tests.test_run import ROOT, TOY
 
@@ -135,7 +135,9 @@ def test_the_check_of_a_persons_own_devices():
     assert (one, two) == ("1", "2") and first == second and len(first) == 16
 
 
-def test_what_is_set_apart_stays_as_it_is():
+@pytest.mark.parametrize("by_kernel", [False, True])
+def test_what_is_set_apart_stays_as_it_is(by_kernel, monkeypatch):
+    monkeypatch.setattr(own_kernels, "can_run", lambda: by_kernel)
     tree = {
         "float": jnp.array([[0.0, -0.0], [jnp.inf, -1e-42]]),
         "half": jnp.array(1.5, jnp.bfloat16),
