@@ -172,7 +172,7 @@ class TensorBoardSink:
 class WandbSink:
     """Sends records to Weights & Biases; a resumed run goes on under the same id."""
 
-    def __init__(self, folder: Path, mode: str, project: str, run_id: str, config: Record) -> None:
+    def __init__(self, folder: Path, mode: Any, project: str, run_id: str, config: Record) -> None:
         """Starts or continues the W&B run; its files go under the run's folder."""
         import wandb
 
