@@ -35,8 +35,8 @@ from purerl.folding import (
     known_constant,
     known_literal,
 )
-from purerl.loops import MOST_ROUNDS, WRITTEN_OUT, has_loop, is_innermost, rounds, sub_jaxprs
-from purerl.ordered_sums import gathered_scatter, ordered_scatter, source
+from purerl.loops import MOST_ROUNDS, WRITTEN_OUT, is_written_out, rounds, sub_jaxprs
+from purerl.ordered_sums import gathered_scatter, ordered_scatter, puts, source
 from purerl.types import Array, PyTree
 
 _SUMS = ("scatter-add", "scatter_add", "scatter-mul", "scatter_mul", "scatter-sub", "scatter_sub")
@@ -106,11 +106,11 @@ def for_gpu() -> bool:
 
 
 def _is_rewritten(eqn: core.JaxprEqn) -> bool:
-    """Says whether there is a replacement for an equation or for one inside of it."""
+    """Says whether there may be a replacement for an equation or for one inside of it."""
     return (
         _is_unordered(eqn)
         or small_systems.wanted(eqn)
-        or (for_gpu() and (eqn.primitive.name == "scatter" or is_innermost(eqn)))
+        or (for_gpu() and (puts(eqn) or is_written_out(eqn)))
         or any(_is_rewritten(inner) for sub in sub_jaxprs(eqn) for inner in sub.jaxpr.eqns)
     )
 
@@ -176,12 +176,15 @@ def _apply(eqn: core.JaxprEqn, inputs: list, known: list[Known], shared: dict) -
         return small_systems.compute(eqn, inputs)
     if name != "while" and not _is_rewritten(eqn):
         return bind_equation(eqn, inputs)
-    if name == "scatter" and known[1] is not None:
+    if puts(eqn) and known[1] is not None:
         return [gathered_scatter(eqn, inputs, known)]
     if name in CALLS:
         return _evaluate(called_jaxpr(eqn), known, shared, *inputs)
     if name in _LOOPS:
-        return list(_LOOPS[name](eqn.params, inputs, known, shared))
+        params = eqn.params
+        if for_gpu() and is_written_out(eqn):
+            params = params | {"unroll": min(WRITTEN_OUT, params["length"])}
+        return list(_LOOPS[name](params, inputs, known, shared))
     if not any(list_scatter_sums(sub) for sub in sub_jaxprs(eqn)):
         return bind_equation(eqn, inputs)
     raise RuntimeError(
@@ -199,11 +202,8 @@ def _scan(params: dict, inputs: list, known: list[Known], shared: dict) -> list:
         return out[:m], out[m:]
 
     carry, xs = list(inputs[n : n + m]), list(inputs[n + m :])
-    unroll = params["unroll"]
-    if for_gpu() and not has_loop(body):
-        unroll = max(unroll, min(WRITTEN_OUT, params["length"]))
     carry, ys = lax.scan(
-        step, carry, xs, params["length"], reverse=params["reverse"], unroll=unroll
+        step, carry, xs, params["length"], reverse=params["reverse"], unroll=params["unroll"]
     )
     return [*carry, *ys]
 

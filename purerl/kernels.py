@@ -25,6 +25,10 @@ GRAPHS = {
     "xla_gpu_command_buffer_scheduling_mode": "CONCURRENT",
     "xla_gpu_graph_min_graph_size": "1",
 }
+# Passes that change bits with the number of devices. The first is run for several alone, and makes
+# other sums; the second puts products together that share a factor, in an order that is arbitrary.
+PASSES = "xla_disable_hlo_passes"
+UNEQUAL_PASSES = "spmd-simplify,dot-merger"
 FIXING_FLAGS = (
     f"{LEVEL}=0",
     "xla_gpu_deterministic_ops=true",
@@ -52,3 +56,13 @@ def how_chosen(platform: str) -> str:
     flags = os.environ.get("XLA_FLAGS", "")
     fixed = platform != "gpu" or any(flag in flags for flag in FIXING_FLAGS)
     return "fixed" if fixed else "by timing"
+
+
+def equal_passes() -> dict[str, str]:
+    """Returns the compiler option for a program of several devices: which passes are off.
+
+    It takes the place of what XLA_FLAGS says of passes, so that is a part of it.
+    """
+    flags = (flag.lstrip("-").partition("=") for flag in os.environ.get("XLA_FLAGS", "").split())
+    users = [value for name, _, value in flags if name == PASSES]
+    return {PASSES: ",".join([UNEQUAL_PASSES, *users])}

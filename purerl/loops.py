@@ -7,9 +7,12 @@ from purerl.folding import Known
 # A scan makes all its rounds. Beyond so many, the loop most likely ends far earlier: MuJoCo's
 # default is 100 iterations, of which a cartpole needs two.
 MOST_ROUNDS = 16
-# Rounds written out one after another on a GPU, where every round copies what the loop carries: a
-# physics step of an ant was faster by 8%, its four rounds of line search written out (H100).
+# Rounds written out one after another on a GPU, where every round copies what the loop carries: an
+# ant's physics alone was faster by 9%, its four rounds of line search written out (H100).
 WRITTEN_OUT = 4
+# Equations of a round to be written out. A line search has 300; a whole physics step, 6,000 for six
+# hinges, took three times as long to compile.
+FEW_EQUATIONS = 1000
 
 
 def sub_jaxprs(eqn: core.JaxprEqn) -> list[core.ClosedJaxpr]:
@@ -35,9 +38,20 @@ def is_loop(eqn: core.JaxprEqn) -> bool:
     return name == "while" or (name == "scan" and params["unroll"] < params["length"])
 
 
-def is_innermost(eqn: core.JaxprEqn) -> bool:
-    """Tells whether an equation is a scan with no loop inside, as MJX's line search is."""
-    return eqn.primitive.name == "scan" and not has_loop(eqn.params["jaxpr"])
+def is_written_out(eqn: core.JaxprEqn) -> bool:
+    """Tells whether rounds of a loop pay written out: a short scan with no loop inside.
+
+    As MJX's line search is.
+    """
+    if eqn.primitive.name != "scan" or eqn.params["unroll"] > 1:
+        return False
+    body = eqn.params["jaxpr"]
+    return not has_loop(body) and count_equations(body) < FEW_EQUATIONS
+
+
+def count_equations(closed: core.ClosedJaxpr) -> int:
+    """Returns the number of equations of a trace, at any depth."""
+    return sum(1 + sum(map(count_equations, sub_jaxprs(eqn))) for eqn in closed.jaxpr.eqns)
 
 
 def rounds(params: dict, known: list[Known]) -> int | None:

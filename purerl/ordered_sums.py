@@ -41,10 +41,19 @@ def ordered_scatter(eqn: core.JaxprEqn, inputs: list, known: list[Known]) -> Arr
     return jnp.reshape(_take(jnp.concatenate([whole, total]), place), operand.shape)
 
 
-def gathered_scatter(eqn: core.JaxprEqn, inputs: list, known: list[Known]) -> Array:
-    """A scatter that puts updates in their places, the last where several meet, as one gather.
+def puts(eqn: core.JaxprEqn) -> bool:
+    """Says whether an equation is a scatter that puts updates in their places, as `.set` does.
 
-    XLA has two kernels for a scatter, one of them a copy, and neither is fused with others.
+    `.apply` is called the same, and computes something of what stands there.
+    """
+    return eqn.primitive.name == "scatter" and eqn.params["update_jaxpr"] is None
+
+
+def gathered_scatter(eqn: core.JaxprEqn, inputs: list, known: list[Known]) -> Array:
+    """A scatter that `puts`, with constant indices, as one gather; of updates that meet, the last.
+
+    XLA has two kernels for a scatter, one of them a copy, and neither is fused with others. It
+    leaves open which of several updates is kept; the last here is the last in row-major order.
     """
     operand, _, updates = inputs
     addresses = _addresses(eqn, np.asarray(known[1]()))

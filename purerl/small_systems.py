@@ -32,7 +32,7 @@ def wanted(eqn: core.JaxprEqn) -> bool:
     if name not in ("cholesky", "triangular_solve") or not own_kernels.can_run():
         return False
     matrix, *sides = [cast(Any, v.aval) for v in eqn.invars]
-    small = matrix.ndim == 2 and matrix.shape[0] <= LARGEST and matrix.dtype == jnp.float32
+    small = matrix.ndim == 2 and 0 < matrix.shape[0] <= LARGEST and matrix.dtype == jnp.float32
     if name == "cholesky":
         return small
     plain = eqn.params["left_side"] and not eqn.params["unit_diagonal"]

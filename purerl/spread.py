@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
-from purerl import ppo
+from purerl import kernels, ppo
 from purerl.compilation import Programs, jit, shapes, start, unordered, when_needed
 from purerl.config import Config
 from purerl.env import Env
@@ -30,9 +30,6 @@ from purerl.types import Array, Metrics, Network, PyTree, TrainState
 PLACES = ("env", "carry", "episode", "discounted_return")  # fields of TrainState that are [B, ...]
 SAME = PartitionSpec()  # a copy on every device
 SPLIT = PartitionSpec(AXIS)
-# Passes that change bits with the number of devices. The first is run for several alone, and makes
-# other sums; the second puts products together that share a factor, in an order that is arbitrary.
-NO_PASSES = {"xla_disable_hlo_passes": "spmd-simplify,dot-merger"}
 
 
 class Spread(NamedTuple):
@@ -208,7 +205,7 @@ def compile_programs(
             functools.partial(ppo.improve, config, network, shards=shards),
             mesh=layout.mesh, in_specs=(SAME, SPLIT), out_specs=SAME, check_vma=False,
         ),
-        compiler_options=NO_PASSES,
+        compiler_options=kernels.equal_passes(),
     )  # fmt: skip
     whole = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct((shards.number, *x.shape[1:]), x.dtype), experience

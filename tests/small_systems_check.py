@@ -18,7 +18,7 @@ import numpy as np
 from purerl import kernels, small_systems
 from purerl.types import Array
 
-SIZES = ((3, 4096), (8, 4096), (14, 4096), (16, 4096), (23, 2048), (27, 4096), (32, 4096))
+SIZES = {1: 4096, 3: 4096, 8: 4096, 14: 4096, 16: 4096, 23: 2048, 27: 4096, 32: 4096}
 ROUNDS = 50
 
 
@@ -72,15 +72,15 @@ def main() -> int:
     kernels.set_flags()
     if jax.default_backend() != "gpu":
         sys.exit("JAX finds no GPU, and on a CPU these kernels are only interpreted.")
-    row, worst = "{:>4} {:>7} {:>10} {:>10} {:>12} {:>12}", 0.0
+    row, right = "{:>4} {:>7} {:>10} {:>10} {:>12} {:>12}", True
     print(row.format("rows", "systems", "here [us]", "JAX [us]", "error here", "of JAX"))
-    for rows, number in SIZES:
+    for rows, number in SIZES.items():
         given = tuple(map(jnp.asarray, systems(rows, number)))
         times = [f"{microseconds(solve, *given):.0f}" for solve in (here, library)]
         errors = [error(solve, *systems(rows, number)) for solve in (here, library)]
-        worst = max(worst, errors[0])
+        right = right and errors[0] < 1e-5  # not so of NaN
         print(row.format(rows, number, *times, *(f"{e:.1e}" for e in errors)), flush=True)
-    return 0 if worst < 1e-5 else 1
+    return 0 if right else 1
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxpr_as_fun
 
-from purerl import deterministic
+from purerl import deterministic, loops
 from purerl.deterministic import trace_deterministic
 from purerl.loops import WRITTEN_OUT, sub_jaxprs
 from purerl.physics import Physics
@@ -59,6 +59,19 @@ def test_what_is_put_at_known_places_is_gathered(name):
     np.testing.assert_array_equal(got, want)
 
 
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: x.at[np.array([1, 3])].apply(jnp.sin),
+        lambda x: x.at[np.array([1, 1])].multiply(2, unique_indices=True),
+    ],
+)
+def test_what_is_computed_in_its_place_stays(function):
+    x = jnp.arange(1.0, 9.0)
+    (got,) = jaxpr_as_fun(trace_deterministic(function, x))(x)
+    np.testing.assert_array_equal(got, function(x))
+
+
 def test_what_is_put_at_places_known_only_later_stays():
     closed = trace_deterministic(lambda x, i: x.at[i].set(7.0), jnp.zeros(3), jnp.arange(2))
     assert named(closed, "scatter")
@@ -78,6 +91,16 @@ def test_only_the_innermost_of_loops_is_written_out(length):
     assert [eqn.params["unroll"] for eqn in named(closed, "scan")] == [1, min(length, WRITTEN_OUT)]
     for got, want in zip(jax.vmap(jaxpr_as_fun(closed))(x), jax.vmap(nested)(x), strict=True):
         np.testing.assert_allclose(got, want, rtol=1e-6)
+
+
+def test_a_long_round_is_not_written_out(monkeypatch):
+    def loop(x):
+        return jax.lax.scan(lambda c, _: (jnp.sin(c) + 1.0, None), x, None, 5)[0]
+
+    monkeypatch.setattr(loops, "FEW_EQUATIONS", 2)
+    assert [e.params["unroll"] for e in named(trace_deterministic(loop, 1.0), "scan")] == [1]
+    monkeypatch.setattr(loops, "FEW_EQUATIONS", 3)
+    assert [e.params["unroll"] for e in named(trace_deterministic(loop, 1.0), "scan")] == [4]
 
 
 def test_a_physics_step_for_a_gpu_is_the_same_step():

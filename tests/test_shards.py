@@ -15,8 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from purerl import checkpoint, normalizer, own_kernels, shards
+from purerl import checkpoint, kernels, normalizer, own_kernels, rundir, shards, spread
 from purerl.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
+from purerl.experiment import Evaluation
+from tests import toy_experiment
 from tests.test_run import ROOT, TOY
 
 CARTPOLE = [str(ROOT / "experiments" / "cartpole_swingup.py"), "--ppo.num-envs", "16"]
@@ -150,6 +152,39 @@ def test_what_is_set_apart_stays_as_it_is(by_kernel, monkeypatch):
         for before, after in zip(jax.tree.leaves(tree), jax.tree.leaves(apart(tree)), strict=True):
             assert (after.shape, after.dtype) == (before.shape, before.dtype)
             assert np.asarray(after).tobytes() == np.asarray(before).tobytes()
+
+
+def test_a_shard_and_what_shards_send_pass_a_kernel_that_does_nothing(monkeypatch):
+    """On a CPU bits are the same without, nearly always."""
+    monkeypatch.setattr(own_kernels, "can_run", lambda: True)
+    cut = shards.Shards(2)
+    weight = jnp.ones(3)
+    run = jax.make_jaxpr(lambda x: shards.total(cut, lambda y: (weight * y).sum(0), x))
+    closed = run(jnp.ones((2, 5, 3)))
+
+    def passes(jaxpr):  # in order, and how many arrays each
+        return [len(e.outvars) for e in jaxpr.eqns if e.primitive.name == "pallas_call"
+                and len(e.params["input_output_aliases"]) == len(e.outvars)]  # fmt: skip
+
+    (loop,) = [e for e in closed.jaxpr.eqns if e.primitive.name == "scan"]
+    assert passes(loop.params["jaxpr"].jaxpr) == [2, 1]  # the weight and the shard; the sum
+    assert passes(closed.jaxpr) == [1]  # all sums
+    monkeypatch.setattr(shards, "AT_ONCE", 3)
+    assert passes(jax.make_jaxpr(shards.set_apart)([weight] * 7).jaxpr) == [3, 3, 1]
+
+
+def test_passes_that_are_off_are_the_users_too(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_a=b --xla_disable_hlo_passes=dce,fusion")
+    assert kernels.equal_passes()[kernels.PASSES] == f"{kernels.UNEQUAL_PASSES},dce,fusion"
+    monkeypatch.delenv("XLA_FLAGS")
+    assert kernels.equal_passes()[kernels.PASSES] == kernels.UNEQUAL_PASSES
+
+
+def test_what_learns_from_several_shards_is_compiled_without_them(monkeypatch):
+    monkeypatch.setattr(kernels, "equal_passes", lambda: {"xla_no_such_option": "1"})
+    config, env, network, _ = rundir.build(toy_experiment.experiment)
+    with pytest.raises(Exception, match="xla_no_such_option"):
+        spread.compile_programs(config, env, network, Evaluation(number=0), True, shards.Shards(2))
 
 
 # --- several processes ---
