@@ -138,13 +138,16 @@ def from_all(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
 
 
 def gather(shards: Shards, parts: PyTree) -> PyTree:
-    """Returns what all shards have [V, ...], from this device's [v, ...]; one message a dtype.
+    """Returns what all shards have [V, ...], from this device's [v, ...].
 
     Set apart, since on several devices it comes in one row: XLA computed a gradient's norm from
     slices of that row by other kernels than from arrays, and in 800 steps one differed.
     """
-    if shards.devices == 1:
-        return set_apart(parts)
+    return set_apart(parts if shards.devices == 1 else exchange(shards, parts))
+
+
+def exchange(shards: Shards, parts: PyTree) -> PyTree:
+    """Sends what this device's shards have [v, ...] to all devices, one message a dtype."""
     leaves, structure = jax.tree.flatten(parts)
     gathered: list[Array] = [jnp.empty(0)] * len(leaves)
     for dtype in dict.fromkeys(leaf.dtype for leaf in leaves):
@@ -154,7 +157,7 @@ def gather(shards: Shards, parts: PyTree) -> PyTree:
         ends = np.cumsum([row.shape[1] for row in rows])
         for i, columns in zip(places, jnp.split(everyone, ends[:-1], axis=1), strict=True):
             gathered[i] = columns.reshape(shards.number, *leaves[i].shape[1:])
-    return set_apart(jax.tree.unflatten(structure, gathered))
+    return jax.tree.unflatten(structure, gathered)
 
 
 def add_in_order(x: Array) -> Array:

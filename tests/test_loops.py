@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from purerl.deterministic import trace_deterministic
-from purerl.loops import sub_jaxprs
+from purerl.loops import has_loop, sub_jaxprs
 
 LIMIT = 5
 
@@ -65,3 +65,12 @@ def test_other_loops_stay(loop):
     got = jax.extend.core.jaxpr_as_fun(closed)(jnp.float32(3.0))
     for a, b in zip(got, jax.tree.leaves(loop(jnp.float32(3.0))), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("unroll, loops", [(1, True), (3, True), (4, False)])
+def test_rounds_that_are_all_written_out_are_no_loop(unroll, loops):
+    def inside(x):
+        scan = jax.lax.scan(lambda c, _: (c * x, c), x, None, 4, unroll=unroll)
+        return jax.jit(lambda y: y[0])(scan)
+
+    assert has_loop(jax.make_jaxpr(inside)(1.0)) == loops
