@@ -35,7 +35,7 @@ from purerl.folding import (
     known_constant,
     known_literal,
 )
-from purerl.loops import MOST_ROUNDS, WRITTEN_OUT, is_written_out, rounds, sub_jaxprs
+from purerl.loops import MOST_ROUNDS, WRITTEN_OUT, equations, is_written_out, rounds, sub_jaxprs
 from purerl.ordered_sums import gathered_scatter, ordered_scatter, puts, source
 from purerl.types import Array, PyTree
 
@@ -82,13 +82,11 @@ def list_scatter_sums(closed: core.ClosedJaxpr) -> list[ScatterSum]:
 
     Integer sums are exact, and `unique_indices` promises that no two terms meet: neither counts.
     """
-    found = []
-    for eqn in closed.jaxpr.eqns:
-        if _is_unordered(eqn):
-            found.append(ScatterSum(eqn.primitive.name, eqn.invars[0].aval.shape, source(eqn)))
-        for sub in sub_jaxprs(eqn):
-            found += list_scatter_sums(sub)
-    return found
+    return [
+        ScatterSum(eqn.primitive.name, eqn.invars[0].aval.shape, source(eqn))
+        for eqn in equations(closed)
+        if _is_unordered(eqn)
+    ]
 
 
 def _is_unordered(eqn: core.JaxprEqn) -> bool:

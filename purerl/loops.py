@@ -1,5 +1,7 @@
 """What a trace tells of a loop before it runs."""
 
+from collections.abc import Iterator
+
 from jax.extend import core
 
 from purerl.folding import Known
@@ -27,9 +29,17 @@ def sub_jaxprs(eqn: core.JaxprEqn) -> list[core.ClosedJaxpr]:
     return found
 
 
+def equations(closed: core.ClosedJaxpr) -> Iterator[core.JaxprEqn]:
+    """Yields all equations of a trace, at any depth, each before those inside of it."""
+    for eqn in closed.jaxpr.eqns:
+        yield eqn
+        for sub in sub_jaxprs(eqn):
+            yield from equations(sub)
+
+
 def has_loop(closed: core.ClosedJaxpr) -> bool:
     """Tells whether a trace loops, at any depth, and not in rounds that are all written out."""
-    return any(is_loop(eqn) or any(map(has_loop, sub_jaxprs(eqn))) for eqn in closed.jaxpr.eqns)
+    return any(map(is_loop, equations(closed)))
 
 
 def is_loop(eqn: core.JaxprEqn) -> bool:
@@ -46,12 +56,7 @@ def is_written_out(eqn: core.JaxprEqn) -> bool:
     if eqn.primitive.name != "scan" or eqn.params["unroll"] > 1:
         return False
     body = eqn.params["jaxpr"]
-    return not has_loop(body) and count_equations(body) < FEW_EQUATIONS
-
-
-def count_equations(closed: core.ClosedJaxpr) -> int:
-    """Returns the number of equations of a trace, at any depth."""
-    return sum(1 + sum(map(count_equations, sub_jaxprs(eqn))) for eqn in closed.jaxpr.eqns)
+    return not has_loop(body) and sum(1 for _ in equations(body)) < FEW_EQUATIONS
 
 
 def rounds(params: dict, known: list[Known]) -> int | None:

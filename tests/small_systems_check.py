@@ -75,9 +75,10 @@ def main() -> int:
     row, right = "{:>4} {:>7} {:>10} {:>10} {:>12} {:>12}", True
     print(row.format("rows", "systems", "here [us]", "JAX [us]", "error here", "of JAX"))
     for rows, number in SIZES.items():
-        given = tuple(map(jnp.asarray, systems(rows, number)))
-        times = [f"{microseconds(solve, *given):.0f}" for solve in (here, library)]
-        errors = [error(solve, *systems(rows, number)) for solve in (here, library)]
+        given = systems(rows, number)
+        on_gpu = tuple(map(jnp.asarray, given))
+        times = [f"{microseconds(solve, *on_gpu):.0f}" for solve in (here, library)]
+        errors = [error(solve, *given) for solve in (here, library)]
         right = right and errors[0] < 1e-5  # not so of NaN
         print(row.format(rows, number, *times, *(f"{e:.1e}" for e in errors)), flush=True)
     return 0 if right else 1

@@ -9,7 +9,7 @@ from jax.extend.core import jaxpr_as_fun
 
 from purerl import deterministic, loops
 from purerl.deterministic import trace_deterministic
-from purerl.loops import WRITTEN_OUT, sub_jaxprs
+from purerl.loops import WRITTEN_OUT, equations
 from purerl.physics import Physics
 
 # A ball joint, whose quaternion is put together by parts, and a hinge that its limit stops.
@@ -33,12 +33,6 @@ ARM = """
 @pytest.fixture(autouse=True)
 def _for_gpu(monkeypatch):
     monkeypatch.setattr(deterministic, "for_gpu", lambda: True)
-
-
-def equations(closed):
-    """Returns all equations of a trace, at any depth."""
-    inner = [e for eqn in closed.jaxpr.eqns for sub in sub_jaxprs(eqn) for e in equations(sub)]
-    return [*closed.jaxpr.eqns, *inner]
 
 
 def named(closed, name):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from purerl.deterministic import trace_deterministic
-from purerl.loops import has_loop, sub_jaxprs
+from purerl.loops import equations, has_loop
 
 LIMIT = 5
 
@@ -28,8 +28,7 @@ def newton(x, start=0, limit=LIMIT, step=1):
 
 def primitives(closed):
     """Returns the names of all primitives of a trace, at any depth."""
-    found = {eqn.primitive.name for eqn in closed.jaxpr.eqns}
-    return found.union(*(primitives(s) for eqn in closed.jaxpr.eqns for s in sub_jaxprs(eqn)))
+    return {eqn.primitive.name for eqn in equations(closed)}
 
 
 def test_a_counted_loop_becomes_a_scan_that_stops_where_the_loop_did():

@@ -15,7 +15,7 @@ from dm_control import suite
 from envs import run
 from purerl import model as lookup
 from purerl.deterministic import list_scatter_sums, trace_deterministic
-from purerl.loops import sub_jaxprs
+from purerl.loops import equations
 from purerl.physics import CHANGEABLE_FIELDS, READINGS, Physics, choose_engine
 
 # Two legs that touch a floor, a ball, a tendon, a filtered motor, a mocap body and sensors.
@@ -472,9 +472,8 @@ def test_rewriting_changes_no_number_of_mjx():
 
 def products(closed):
     """Returns the precision of every matrix product in a trace, at any depth."""
-    found = [e.params["precision"] for e in closed.jaxpr.eqns if e.primitive.name == "dot_general"]
-    subs = [sub for e in closed.jaxpr.eqns for sub in sub_jaxprs(e)]
-    return found + [precision for sub in subs for precision in products(sub)]
+    dots = [e for e in equations(closed) if e.primitive.name == "dot_general"]
+    return [e.params["precision"] for e in dots]
 
 
 def test_physics_multiplies_matrices_in_whole_float32():
