@@ -29,6 +29,7 @@ from mujoco.mjx.warp.types import _BATCH_DIM  # noqa: E402
 from purerl.engine_jax import (  # noqa: E402
     field_of,
     load_state,
+    make_data,
     mjx,
     mjx_defaults,
     put_model,
@@ -73,12 +74,10 @@ class WarpEngine:
         with mjx_defaults():
             self.model, self.free = _put_model(model), _put_model(free)
             self.contacts, self.rows = room(model, self.model)
-            self.data = mjx.make_data(model, impl="warp", naconmax=0, njmax=self.rows)
+            self.data = make_data(model, "warp", naconmax=0, njmax=self.rows)
             # The model without constraints needs no room for them.
             own = free.opt.disableflags == model.opt.disableflags
-            self.free_data = (
-                self.data if own else mjx.make_data(free, impl="warp", naconmax=0, njmax=0)
-            )
+            self.free_data = self.data if own else make_data(free, "warp", naconmax=0, njmax=0)
 
     def init(self, state: PyTree, changes: dict[str, Array]) -> tuple:
         """Returns the readings at `state` under no control."""

@@ -14,6 +14,7 @@ import optax
 from purerl import losses
 from purerl.config import Config
 from purerl.keys import Purpose, derive
+from purerl.losses import Scale
 from purerl.rollout import select
 from purerl.shards import WHOLE, Shards, each, move, numbers, total
 from purerl.slices import count_slices, cut_in_slices, of_slices, sum_of_slices
@@ -65,13 +66,15 @@ def learn(
     learner = Learner(state.params, state.optimizer, rate, state.skipped_in_a_row)
     key = derive(state.key, Purpose.PERMUTATION, state.update)
 
-    def step(learner: Learner, index: Array) -> tuple[Learner, Metrics]:
+    def step(learner: Learner, part: tuple[Array, Scale | None]) -> tuple[Learner, Metrics]:
+        index, scale = part
         minibatch, start = move(shards, _take, batch, memory, index)
-        return minibatch_step(config, network, learner, minibatch, start, shards)
+        return minibatch_step(config, network, learner, minibatch, start, scale, shards)
 
     def epoch(learner: Learner, number: Array) -> tuple[Learner, Metrics]:
         order = shuffle(jax.random.fold_in(key, number), columns, config.num_minibatches, shards)
-        return jax.lax.scan(step, learner, order)
+        scales = None if config.segment_length else scales_of_all(batch, order, shards)
+        return jax.lax.scan(step, learner, (order, scales))
 
     learner, metrics = jax.lax.scan(epoch, learner, jnp.arange(config.num_epochs))
     state = state.replace(**learner._asdict())
@@ -96,6 +99,18 @@ def learn(
 def _take(batch: Batch, memory: PyTree, index: Array) -> tuple[Batch, PyTree]:
     minibatch = jax.tree.map(lambda x: jnp.take(x, index, axis=1), batch)
     return minibatch, jax.tree.map(lambda x: jnp.take(x, index, axis=0), memory)
+
+
+def scales_of_all(batch: Batch, order: Array, shards: Shards) -> Scale:
+    """Returns the advantages' scales in all minibatches of an epoch, [K]: one message for them."""
+
+    def take(x: Array, order: Array) -> Array:
+        return jnp.moveaxis(jnp.take(x, order, axis=1), 1, 0)  # [K, T', M]
+
+    if shards.number > 1:
+        order = jnp.swapaxes(order, 0, 1)
+    advantage, weight = (move(shards, take, x, order) for x in (batch.advantage, batch.weight))
+    return losses.advantage_scale(advantage, weight, shards, axes=(-2, -1))
 
 
 def shuffle(key: Array, columns: int, minibatches: int, shards: Shards) -> Array:
@@ -140,7 +155,7 @@ def loss(
     config: Config,
     network: Network,
     params: PyTree,
-    scale: losses.Scale,
+    scale: Scale,
     batch: Batch,
     memory: PyTree,
 ) -> tuple[Array, Metrics]:
@@ -178,16 +193,20 @@ def minibatch_step(
     learner: Learner,
     batch: Batch,
     memory: PyTree,
+    scale: Scale | None,
     shards: Shards,
 ) -> tuple[Learner, Metrics]:
-    """One gradient step, skipped and counted if any of it is not finite."""
+    """One gradient step, skipped and counted if any of it is not finite.
+
+    Without a `scale` of the advantages, segments are estimated anew, and have their own.
+    """
     rows, columns = batch.weight.shape[-2:]  # of one shard
     number = count_slices(rows, columns, jax.default_backend())
     batch, memory = move(shards, functools.partial(cut_in_slices, number), batch, memory)
-    if config.segment_length:
+    if scale is None:
         anew = functools.partial(renew, config, network, learner.params)
         batch = each(shards, functools.partial(of_slices, number, anew), batch, memory)
-    scale = losses.advantage_scale(batch.advantage, batch.weight, shards)
+        scale = losses.advantage_scale(batch.advantage, batch.weight, shards)
 
     def gradient(batch: Batch, memory: PyTree) -> tuple[tuple[Array, Metrics], PyTree]:
         def objective(params: PyTree) -> tuple[Array, Metrics]:

@@ -14,7 +14,7 @@ from purerl.types import Array
 class Scale(NamedTuple):
     """What the parts of a minibatch must agree on."""
 
-    weight: Array  # [] sum of the weights, at least 1
+    weight: Array  # [] sum of the weights, at least 1; of K minibatches [K]
     mean: Array  # [] of the advantages
     std: Array  # []
 
@@ -24,27 +24,32 @@ def weighted_mean(x: Array, weight: Array) -> Array:
     return (weight * x).sum() / jnp.maximum(weight.sum(), 1.0)
 
 
-def weighted_moments(x: Array, weight: Array, shards: Shards = WHOLE) -> tuple[Array, Array, Array]:
-    """Returns sum(weight), at least 1, weighted mean and variance of `x`, [] each, over all axes.
+def weighted_moments(
+    x: Array, weight: Array, shards: Shards = WHOLE, axes: tuple[int, ...] | None = None
+) -> tuple[Array, Array, Array]:
+    """Returns sum(weight), at least 1, weighted mean and variance of `x`, over all axes or `axes`.
 
     Shards' own means and squares are put together as in `normalizer.pool`: one message.
     """
 
     def sums(x: Array, w: Array) -> tuple[Array, Array, Array]:
-        number, whole = w.sum(), (w * x).sum()
+        number, whole = w.sum(axes, keepdims=True), (w * x).sum(axes, keepdims=True)
         mean = whole / jnp.maximum(number, 1.0)
-        return number, whole, (w * jnp.square(x - mean)).sum()
+        square = (w * jnp.square(x - mean)).sum(axes)
+        return number.reshape(square.shape), whole.reshape(square.shape), square
 
     numbers, wholes, squares = from_all(shards, sums, x, weight)
     number = jnp.maximum(add_in_order(numbers), 1.0)
     mean = add_in_order(wholes) / number
-    apart = wholes / jnp.maximum(numbers, 1.0) - mean
+    apart = wholes / jnp.maximum(numbers, 1.0) - mean[None]
     return number, mean, add_in_order(squares + numbers * jnp.square(apart)) / number
 
 
-def advantage_scale(advantage: Array, weight: Array, shards: Shards = WHOLE) -> Scale:
-    """Returns weighted mean and standard deviation of a minibatch's advantages."""
-    number, mean, variance = weighted_moments(advantage, weight, shards)
+def advantage_scale(
+    advantage: Array, weight: Array, shards: Shards = WHOLE, axes: tuple[int, ...] | None = None
+) -> Scale:
+    """Returns weighted mean and deviation of a minibatch's advantages, over all axes or `axes`."""
+    number, mean, variance = weighted_moments(advantage, weight, shards, axes)
     return Scale(weight=number, mean=mean, std=jnp.sqrt(variance))
 
 

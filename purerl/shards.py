@@ -23,7 +23,6 @@ from purerl.loops import has_loop
 from purerl.types import Array, PyTree
 
 AXIS = "devices"
-AT_ONCE = 200  # arrays that pass a kernel: CUDA guarantees it room for 4096 bytes of addresses
 
 
 class Shards(NamedTuple):
@@ -97,18 +96,9 @@ def set_apart(tree: PyTree) -> PyTree:
     """
     leaves, structure = jax.tree.flatten(tree)
     rows = [jnp.ravel(leaf) for leaf in leaves if leaf.size]
-    passed = iter(through_kernel(rows) if own_kernels.can_run() else through_loop(rows))
+    passed = iter(own_kernels.copy(rows) if own_kernels.can_run() else through_loop(rows))
     apart = [next(passed).reshape(leaf.shape) if leaf.size else leaf for leaf in leaves]
     return jax.tree.unflatten(structure, apart)
-
-
-def through_kernel(rows: list[Array]) -> list[Array]:
-    """Passes arrays through a kernel that does nothing, of which XLA does not know that."""
-    passed: list[Array] = []
-    for some in (rows[i : i + AT_ONCE] for i in range(0, len(rows), AT_ONCE)):
-        results = [jax.ShapeDtypeStruct(row.shape, row.dtype) for row in some]
-        passed += own_kernels.call(lambda *references: None, results, *some, in_place=True)
-    return passed
 
 
 def through_loop(rows: list[Array]) -> list[Array]:
@@ -138,25 +128,23 @@ def from_all(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
 
 
 def gather(shards: Shards, parts: PyTree) -> PyTree:
-    """Returns what all shards have [V, ...], from this device's [v, ...].
+    """Returns what all shards have [V, ...], from this device's [v, ...], a message a dtype.
 
-    Set apart, since on several devices it comes in one row: XLA computed a gradient's norm from
-    slices of that row by other kernels than from arrays, and in 800 steps one differed.
+    A row, as it is sent, is set apart on one device too: XLA computed a gradient's norm from slices
+    of a row by other kernels than from arrays, and in 800 steps one differed.
     """
-    return set_apart(parts if shards.devices == 1 else exchange(shards, parts))
-
-
-def exchange(shards: Shards, parts: PyTree) -> PyTree:
-    """Sends what this device's shards have [v, ...] to all devices, one message a dtype."""
     leaves, structure = jax.tree.flatten(parts)
     gathered: list[Array] = [jnp.empty(0)] * len(leaves)
     for dtype in dict.fromkeys(leaf.dtype for leaf in leaves):
         places = [i for i, leaf in enumerate(leaves) if leaf.dtype == dtype]
         rows = [leaves[i].reshape(shards.local, -1) for i in places]
-        everyone = jax.lax.all_gather(jnp.concatenate(rows, axis=1), AXIS, tiled=True)
+        everyone = jnp.concatenate(rows, axis=1)
+        if shards.devices > 1:
+            everyone = jax.lax.all_gather(everyone, AXIS, tiled=True)
         ends = np.cumsum([row.shape[1] for row in rows])
-        for i, columns in zip(places, jnp.split(everyone, ends[:-1], axis=1), strict=True):
-            gathered[i] = columns.reshape(shards.number, *leaves[i].shape[1:])
+        columns = jnp.split(set_apart(everyone), ends[:-1], axis=1)
+        for i, column in zip(places, columns, strict=True):
+            gathered[i] = column.reshape(shards.number, *leaves[i].shape[1:])
     return jax.tree.unflatten(structure, gathered)
 
 

@@ -5,7 +5,7 @@ import pytest
 from tests.kill_test import kill_many
 from tests.test_run import TOY
 
-LONG = [str(TOY), "--ppo.num-steps", "12800", "--checkpoints", "40"]
+LONG = [str(TOY), "--ppo.num-steps", "4800", "--checkpoints", "15"]
 
 
 @pytest.mark.parametrize(

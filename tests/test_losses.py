@@ -66,6 +66,15 @@ def test_advantage_normalized_over_all_axes():
     np.testing.assert_allclose(normalized.std(), 1.0, rtol=1e-5)
 
 
+def test_several_minibatches_have_each_their_own_scale():
+    advantage = jax.random.normal(jax.random.key(0), (3, 7, 5)) * array(1, 5, 0.1)[:, None, None]
+    weight = jax.random.bernoulli(jax.random.key(1), 0.7, (3, 7, 5)).astype(jnp.float32)
+    together = losses.advantage_scale(advantage, weight, axes=(-2, -1))
+    alone = [losses.advantage_scale(a, w) for a, w in zip(advantage, weight, strict=True)]
+    for found, expected in zip(together, zip(*alone, strict=True), strict=True):
+        np.testing.assert_allclose(found, jnp.stack(expected), rtol=1e-5, atol=1e-6)
+
+
 def test_kl_estimate_is_unbiased_and_never_negative():
     """Two Gaussians of scale 1 whose means differ by 0.3: KL = 0.3^2 / 2."""
     x = jax.random.normal(jax.random.key(0), (200_000,))

@@ -8,10 +8,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from purerl import compilation, evaluation, learner, networks, normalizer, ppo, slices, targets
+from purerl import (
+    compilation,
+    evaluation,
+    learner,
+    losses,
+    networks,
+    normalizer,
+    ppo,
+    slices,
+    targets,
+)
 from purerl.env import State
 from purerl.experiment import Evaluation
 from purerl.rollout import rollout
+from purerl.shards import Shards, move
+from purerl.targets import Batch
 from purerl.types import count_as_int
 
 MLP = networks.MlpOptions(policy_hidden=(8,), value_hidden=(8,))
@@ -266,6 +278,21 @@ def test_segments_stay_whole_and_are_renewed_before_each_gradient_step(monkeypat
     whole = np.asarray(transitions.reward).reshape(4, 4, 6).swapaxes(0, 1).reshape(4, -1)
     epoch = np.concatenate([reward for _, reward in seen[: config.num_minibatches]], axis=1)
     assert {column.tobytes() for column in epoch.T} == {column.tobytes() for column in whole.T}
+
+
+@pytest.mark.parametrize("cut", [Shards(), Shards(2)])
+def test_advantages_of_a_minibatch_are_scaled_by_its_own(cut):
+    shape = (2, 1, 12) if cut.number > 1 else (1, 12)
+    advantage = jax.random.normal(jax.random.key(0), shape)
+    weight = jax.random.bernoulli(jax.random.key(1), 0.8, shape).astype(jnp.float32)
+    batch = Batch(*[advantage] * 8)._replace(weight=weight)
+    order = learner.shuffle(jax.random.key(2), 12, 3, cut)  # 3 minibatches
+    found = learner.scales_of_all(batch, order, cut)
+    for k in range(3):
+        part, _ = move(cut, learner._take, batch, (), order[k])
+        expected = losses.advantage_scale(part.advantage, part.weight)
+        for one, other in zip(found, expected, strict=True):
+            np.testing.assert_allclose(one[k], other, rtol=1e-5)
 
 
 def test_recurrent_memory_restarts_with_each_episode_in_rollout_and_learner():
