@@ -7,6 +7,7 @@ and start are brax's own code with either.
 
 import copy
 import dataclasses
+import importlib.util
 from functools import partial
 from typing import Any, Literal
 
@@ -148,6 +149,11 @@ def put_on_our_physics(env: Any, engine: str) -> None:
 
 def build(options: Options = Options(), engine: str = "auto") -> BraxEnv:  # noqa: B008
     """Builds the environment; `engine` is that of our physics, and brax's have one each."""
+    if importlib.util.find_spec("brax") is None:
+        raise ImportError(
+            f"{options.name!r} is an environment of brax, which is not installed: "
+            "pip install -c constraints.txt -e '.[peers]'"
+        )
     from brax import envs
 
     ours = options.backend == "purerl"

@@ -2,6 +2,7 @@
 
 import functools
 import hashlib
+import importlib.util
 import subprocess
 import sys
 
@@ -11,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from envs import arenas, cartpole_swingup, run
+from envs import arenas, brax_env, cartpole_swingup, run
 from envs.bodies import ANT
 from purerl.env import check_env
 from purerl.physics import PhysicsState
@@ -296,3 +297,9 @@ def test_same_seed_same_bits_in_another_process(name):
         timeout=200,
     )
     assert other.stdout.split()[-1] == digest(name)
+
+
+def test_what_an_environment_of_brax_needs_is_told(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ImportError, match="'ant' is an environment of brax.*peers"):
+        brax_env.build(brax_env.Options(name="ant"))

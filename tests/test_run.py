@@ -23,7 +23,7 @@ from purerl.shards import Shards
 
 TOY = Path(__file__).parent / "toy_experiment.py"
 ROOT = TOY.parent.parent
-LONG = ["--ppo.num-steps", "12800", "--checkpoints", "40"]  # 400 updates: seconds
+LONG = ["--ppo.num-steps", "6400", "--checkpoints", "20"]  # 200 updates: seconds
 
 
 def start(runs: Path, *words: str) -> int:
@@ -234,7 +234,7 @@ def test_a_terminated_process_resumes_to_the_same_bits(tmp_path):
     _, said = process.communicate(timeout=60)
     assert process.returncode == INTERRUPTED, said
     assert "--resume" in said and "Traceback" not in said
-    assert checkpoints(tmp_path)[-1] < 400
+    assert checkpoints(tmp_path)[-1] < 200
     process = spawn(tmp_path, *LONG, "--resume")
     said, wrong = process.communicate(timeout=120)
     assert process.returncode == SUCCESS, wrong

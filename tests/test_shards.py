@@ -29,6 +29,14 @@ ENGINE = {engine: [*CARTPOLE, "--engine", engine] for engine in ("c", "jax")}
 EIGHT = [str(TOY), "--ppo.num-envs", "16", "--num-shards", "8", "--checkpoints", "3"]
 
 
+def cached() -> dict[str, str]:
+    """Returns an environment in which all tests' processes share what they compiled."""
+    return os.environ | {
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_COMPILATION_CACHE_DIR": jax.config.values["jax_compilation_cache_dir"],
+    }
+
+
 def spawn(runs: Path, devices: int, *words: str) -> subprocess.Popen:
     """Starts a run in a process that has so many virtual devices."""
     flags = f"--xla_force_host_platform_device_count={devices}"
@@ -36,12 +44,7 @@ def spawn(runs: Path, devices: int, *words: str) -> subprocess.Popen:
         [sys.executable, "-m", "purerl.run", *words, "--runs", str(runs)],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         # The size of XLA's pool changes bits on a CPU, and it is no smaller than the devices.
-        env=os.environ | {
-            "NPROC": "8",
-            "XLA_FLAGS": f"--xla_cpu_multi_thread_eigen=false {flags}",
-            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-            "JAX_COMPILATION_CACHE_DIR": jax.config.values["jax_compilation_cache_dir"],
-        },
+        env=cached() | {"NPROC": "8", "XLA_FLAGS": f"--xla_cpu_multi_thread_eigen=false {flags}"},
     )  # fmt: skip
 
 
@@ -132,10 +135,10 @@ def test_by_default_every_device_has_a_shard(tmp_path, words):
 
 def test_the_check_of_a_persons_own_devices():
     """Its short form, on two virtual ones."""
-    words = ["2", "--", str(TOY), "--ppo.num-envs", "16", "--ppo.num-steps", "512"]
+    words = ["2", "--", str(TOY), *LARGER]  # compiled in the test above
     said = subprocess.run(
         [sys.executable, "-m", "tests.shards_check", *words],
-        cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True, timeout=200,
+        cwd=ROOT, env=cached(), stdout=subprocess.PIPE, text=True, check=True, timeout=200,
     ).stdout  # fmt: skip
     (one, *_, first), (two, *_, second) = (line.split() for line in said.splitlines()[1:])
     assert (one, two) == ("1", "2") and first == second and len(first) == 16
