@@ -110,7 +110,7 @@ def scales_of_all(batch: Batch, order: Array, shards: Shards) -> Scale:
     if shards.number > 1:
         order = jnp.swapaxes(order, 0, 1)
     advantage, weight = (move(shards, take, x, order) for x in (batch.advantage, batch.weight))
-    return losses.advantage_scale(advantage, weight, shards, axes=(-2, -1))
+    return losses.advantage_scale(advantage, weight, shards, several=True)
 
 
 def shuffle(key: Array, columns: int, minibatches: int, shards: Shards) -> Array:

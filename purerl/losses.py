@@ -5,6 +5,7 @@ Every mean is weighted: `weight` is 1 for a sound sample and 0 for one whose phy
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from purerl.shards import WHOLE, Shards, add_in_order, from_all
@@ -25,20 +26,21 @@ def weighted_mean(x: Array, weight: Array) -> Array:
 
 
 def weighted_moments(
-    x: Array, weight: Array, shards: Shards = WHOLE, axes: tuple[int, ...] | None = None
+    x: Array, weight: Array, shards: Shards = WHOLE, several: bool = False
 ) -> tuple[Array, Array, Array]:
-    """Returns sum(weight), at least 1, weighted mean and variance of `x`, over all axes or `axes`.
+    """Returns sum(weight), at least 1, weighted mean and variance of `x`, [] each, over all axes.
 
-    Shards' own means and squares are put together as in `normalizer.pool`: one message.
+    Of `several` batches, [K, ...], those of each, [K]. Shards' own means and squares are put
+    together as in `normalizer.pool`: one message.
     """
 
     def sums(x: Array, w: Array) -> tuple[Array, Array, Array]:
-        number, whole = w.sum(axes, keepdims=True), (w * x).sum(axes, keepdims=True)
+        number, whole = w.sum(), (w * x).sum()
         mean = whole / jnp.maximum(number, 1.0)
-        square = (w * jnp.square(x - mean)).sum(axes)
-        return number.reshape(square.shape), whole.reshape(square.shape), square
+        return number, whole, (w * jnp.square(x - mean)).sum()
 
-    numbers, wholes, squares = from_all(shards, sums, x, weight)
+    of_each = jax.vmap(sums) if several else sums
+    numbers, wholes, squares = from_all(shards, of_each, x, weight)
     number = jnp.maximum(add_in_order(numbers), 1.0)
     mean = add_in_order(wholes) / number
     apart = wholes / jnp.maximum(numbers, 1.0) - mean[None]
@@ -46,10 +48,10 @@ def weighted_moments(
 
 
 def advantage_scale(
-    advantage: Array, weight: Array, shards: Shards = WHOLE, axes: tuple[int, ...] | None = None
+    advantage: Array, weight: Array, shards: Shards = WHOLE, several: bool = False
 ) -> Scale:
-    """Returns weighted mean and deviation of a minibatch's advantages, over all axes or `axes`."""
-    number, mean, variance = weighted_moments(advantage, weight, shards, axes)
+    """Returns mean and deviation of a minibatch's advantages, or of `several` minibatches', [K]."""
+    number, mean, variance = weighted_moments(advantage, weight, shards, several)
     return Scale(weight=number, mean=mean, std=jnp.sqrt(variance))
 
 

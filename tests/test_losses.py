@@ -69,7 +69,7 @@ def test_advantage_normalized_over_all_axes():
 def test_several_minibatches_have_each_their_own_scale():
     advantage = jax.random.normal(jax.random.key(0), (3, 7, 5)) * array(1, 5, 0.1)[:, None, None]
     weight = jax.random.bernoulli(jax.random.key(1), 0.7, (3, 7, 5)).astype(jnp.float32)
-    together = losses.advantage_scale(advantage, weight, axes=(-2, -1))
+    together = losses.advantage_scale(advantage, weight, several=True)
     alone = [losses.advantage_scale(a, w) for a, w in zip(advantage, weight, strict=True)]
     for found, expected in zip(together, zip(*alone, strict=True), strict=True):
         np.testing.assert_allclose(found, jnp.stack(expected), rtol=1e-5, atol=1e-6)

@@ -226,14 +226,17 @@ def test_with_xla_on_one_thread_the_cores_do_not_matter(tmp_path):
     assert len({json.loads(line)["digest"] for line in last}) == 1
 
 
-def test_a_terminated_process_resumes_to_the_same_bits(tmp_path):
-    """Killed ones: `test_kill.py`."""
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_killed_process_resumes_to_the_same_bits(tmp_path, number):
     process = spawn(tmp_path, *LONG)
     wait_for(lambda: len(checkpoints(tmp_path)) >= 3, process)
-    process.send_signal(signal.SIGTERM)
+    process.send_signal(number)
     _, said = process.communicate(timeout=60)
-    assert process.returncode == INTERRUPTED, said
-    assert "--resume" in said and "Traceback" not in said
+    if number == signal.SIGTERM:
+        assert process.returncode == INTERRUPTED, said
+        assert "--resume" in said and "Traceback" not in said
+    else:
+        assert process.returncode == -signal.SIGKILL
     assert checkpoints(tmp_path)[-1] < 200
     process = spawn(tmp_path, *LONG, "--resume")
     said, wrong = process.communicate(timeout=120)
