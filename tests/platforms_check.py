@@ -21,6 +21,7 @@ import jax
 import numpy as np
 
 from purerl import cli, kernels, ppo, run, rundir, snapshot
+from purerl.errors import leave
 from purerl.experiment import find
 from purerl.rundir import Setup
 from purerl.types import PyTree
@@ -109,4 +110,4 @@ def difference(here: np.ndarray, there: np.ndarray) -> float:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    leave(lambda: main(sys.argv[1:]))
