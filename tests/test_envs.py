@@ -16,6 +16,7 @@ from envs import arenas, brax_env, cartpole_swingup, run
 from envs.bodies import ANT
 from purerl.env import check_env
 from purerl.physics import PhysicsState
+from tests import quick
 
 BUILDERS = {"ant": run.build, "cartpole": cartpole_swingup.build}
 NUMBER, STEPS = 4, 20
@@ -41,7 +42,7 @@ def trajectory(name, engine, height=0.0):
     `height` [m] lifts qpos[2] of the start.
     """
     env = build(name, engine)
-    start = jax.jit(jax.vmap(build(name, "c").reset))(jax.random.split(jax.random.key(3), NUMBER))
+    start = quick.jit(jax.vmap(build(name, "c").reset))(jax.random.split(jax.random.key(3), NUMBER))
     if height:
         qpos = start.physics.qpos.at[:, 2].add(height)
         start = start.replace(physics=start.physics.replace(qpos=qpos))
@@ -52,7 +53,7 @@ def trajectory(name, engine, height=0.0):
         state = jax.vmap(env.step)(state, action)
         return state, state
 
-    return jax.jit(lambda s, a: jax.lax.scan(step, s, a)[1])(start, actions)
+    return quick.jit(lambda s, a: jax.lax.scan(step, s, a)[1])(start, actions)
 
 
 @pytest.mark.parametrize("engine", ["c", "jax"])
@@ -161,7 +162,7 @@ GAPS = run.Options(arena="gaps", randomization=run.Randomization(friction=(0.5, 
 
 def test_every_episode_has_a_corridor_and_a_friction_of_its_own():
     env = run.build(GAPS, "c")
-    reset = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 16))
+    reset = quick.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 16))
     courses, frictions = (
         np.asarray(reset.task["course"]),
         np.asarray(reset.task["factors"]["friction"]),
@@ -267,7 +268,7 @@ def test_the_cartpole_can_be_swung_up_by_pumping():
         state = env.step(state, push[None])
         return state, state.metrics["upright"]
 
-    _, upright = jax.jit(lambda s: jax.lax.scan(step, s, None, 300))(env.reset(jax.random.key(1)))
+    _, upright = quick.jit(lambda s: jax.lax.scan(step, s, None, 300))(env.reset(jax.random.key(1)))
     assert float(upright.max()) > 0.9
 
 

@@ -17,6 +17,7 @@ from purerl import model as lookup
 from purerl.deterministic import list_scatter_sums, trace_deterministic
 from purerl.loops import equations
 from purerl.physics import CHANGEABLE_FIELDS, READINGS, Physics, choose_engine
+from tests import quick
 
 # Two legs that touch a floor, a ball, a tendon, a filtered motor, a mocap body and sensors.
 XML = """
@@ -80,7 +81,7 @@ def starts(number, model):
 def compiled(engine):
     """One program an engine, shared by all tests: compiling MJX takes most of their time."""
     p = physics(engine)
-    return jax.jit(jax.vmap(p.init)), jax.jit(jax.vmap(p.step))
+    return quick.jit(jax.vmap(p.init)), quick.jit(jax.vmap(p.step))
 
 
 @functools.cache
@@ -232,13 +233,13 @@ def test_changes_are_each_environments_own(engine):
     both = {"geom_pos": jnp.float32(np.stack([biped().geom_pos, changed]))}
     qpos, qvel = starts(1, p.model)
     qpos, qvel = jnp.tile(qpos, (2, 1)), jnp.zeros((2, p.model.nv))
-    state, _ = jax.jit(jax.vmap(physics("c").init))(qpos, qvel)
-    _, readings = jax.jit(jax.vmap(p.step))(state, jnp.zeros((2, p.model.nu)), both)
+    state, _ = quick.jit(jax.vmap(physics("c").init))(qpos, qvel)
+    _, readings = quick.jit(jax.vmap(p.step))(state, jnp.zeros((2, p.model.nu)), both)
     lifted = readings.geom_xpos[1] - readings.geom_xpos[0]
     np.testing.assert_allclose(lifted[1], (0.0, 0.0, 0.3), atol=1e-3)
     np.testing.assert_allclose(lifted[2:], 0.0, atol=1e-3)
     if engine == "c":  # what one call changed must not stay for the next
-        plain, _ = jax.jit(jax.vmap(p.step))(state, jnp.zeros((2, p.model.nu)))
+        plain, _ = quick.jit(jax.vmap(p.step))(state, jnp.zeros((2, p.model.nu)))
         np.testing.assert_array_equal(plain.qpos[0], plain.qpos[1])
 
 
@@ -464,7 +465,7 @@ def test_rewriting_changes_no_number_of_mjx():
     state = jax.tree.map(lambda x: x[-1], trajectory("c")[1])
     ctrl = jnp.full((NUMBER, 2), 0.5)
     rewritten = compiled("jax")[1](state, ctrl)
-    plain = jax.jit(jax.vmap(lambda s, u: p._engine._step(s, u, {})))(state, ctrl)
+    plain = quick.jit(jax.vmap(lambda s, u: p._engine._step(s, u, {})))(state, ctrl)
     for x, y in zip(jax.tree.leaves(rewritten), plain, strict=True):
         scale = max(1.0, float(jnp.abs(y).max(initial=0.0)))
         np.testing.assert_allclose(x / scale, y / scale, atol=1e-5)

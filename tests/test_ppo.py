@@ -25,6 +25,7 @@ from purerl.rollout import rollout
 from purerl.shards import Shards, move
 from purerl.targets import Batch
 from purerl.types import count_as_int
+from tests import quick
 
 MLP = networks.MlpOptions(policy_hidden=(8,), value_hidden=(8,))
 GRU = networks.RecurrentOptions(hidden=8, encoder=(8,), value_hidden=(8,))
@@ -72,9 +73,9 @@ class Walk:
         )
 
 
-INIT = jax.jit(ppo.init, static_argnums=(0, 1, 2))
-UPDATE = jax.jit(ppo.update, static_argnums=(0, 1, 2))
-ROLLOUT = jax.jit(rollout, static_argnums=(0, 1, 2))
+INIT = quick.jit(ppo.init, static_argnums=(0, 1, 2))
+UPDATE = quick.jit(ppo.update, static_argnums=(0, 1, 2))
+ROLLOUT = quick.jit(rollout, static_argnums=(0, 1, 2))
 NETWORKS = {
     False: networks.mlp(MLP, jnp.zeros(2), 1),
     True: networks.recurrent(GRU, jnp.zeros(2), 1),

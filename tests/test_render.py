@@ -20,6 +20,7 @@ from purerl import render, run, run_video, scene, video
 from purerl.errors import FAILURE, USAGE, RunError
 from purerl.keys import per_environment
 from purerl.rundir import restore
+from tests import quick
 
 TINY = "--ppo.num-envs 4 --ppo.rollout-length 8 --ppo.num-steps 96 --ppo.num-minibatches 2"
 TINY += " --ppo.episode-length 60 --evaluation.num-episodes 2 --evaluation.number 1"
@@ -95,7 +96,7 @@ def test_states_are_those_of_the_policy_with_repeated_actions(trained):
     assert recording.shown.sum(0).tolist() == [8, 8] and recording.over.all()
     assert recording.length.tolist() == [7, 7]
 
-    step = jax.jit(env.step)
+    step = quick.jit(env.step)
     expected = env.reset(per_environment(key, 2)[1])
     total = 0.0
     for t in range(7):

@@ -13,6 +13,7 @@ from dm_control.utils import rewards
 from envs.suite import base, hopper, tasks
 from envs.suite.rewards import SIGMOIDS, tolerance
 from purerl.env import check_env
+from tests import quick
 
 STATES = 100
 
@@ -37,7 +38,7 @@ def flat(observation) -> np.ndarray:
 def random_states(env, rng):
     """Starts of our own, moved about: qpos, qvel, ctrl and model changes, 100 of each."""
     keys = jax.random.split(jax.random.key(1), STATES)
-    start = jax.jit(jax.vmap(env.domain.start))(keys)
+    start = quick.jit(jax.vmap(env.domain.start))(keys)
     model = env.physics.model
     for i in range(STATES):
         qpos, qvel = np.float64(start.qpos[i]), rng.normal(size=model.nv)
@@ -74,7 +75,7 @@ def observer(env):
         physics, readings = env.physics.init(qpos, qvel, changes)
         return env.state(physics, readings, ctrl, changes)
 
-    return jax.jit(observe)
+    return quick.jit(observe)
 
 
 def put(dm, qpos, qvel, changes):
@@ -115,12 +116,12 @@ def test_steps_are_dm_controls(pair):
     assert env.control_timestep == pytest.approx(dm.control_timestep())
     assert env.action_size == dm.action_spec().shape[0]
     np.testing.assert_allclose(dm.action_spec().minimum, -1)
-    state = jax.jit(env.reset)(jax.random.key(5))
+    state = quick.jit(env.reset)(jax.random.key(5))
     put(dm, state.physics.qpos, state.physics.qvel, state.task)
     np.testing.assert_allclose(
         state.observation, flat(dm.task.get_observation(dm.physics)), atol=1e-5
     )
-    step, rng = jax.jit(env.step), np.random.default_rng(2)
+    step, rng = quick.jit(env.step), np.random.default_rng(2)
     for _ in range(3):
         action = rng.uniform(-1, 1, env.action_size)
         state, expected = step(state, jnp.float32(action)), dm.step(np.float32(action))
@@ -141,10 +142,10 @@ def test_steps_are_dm_controls(pair):
 def test_engines_agree(name):
     """The domains that MJX compiles in seconds, over 10 random control steps."""
     c, mjx = ours(name, "c"), ours(name, "jax")
-    first, rng = jax.jit(c.reset)(jax.random.key(0)), np.random.default_rng(0)
+    first, rng = quick.jit(c.reset)(jax.random.key(0)), np.random.default_rng(0)
     actions = jnp.float32(rng.uniform(-1, 1, (10, c.action_size)))
     last = [
-        jax.jit(
+        quick.jit(
             lambda s, env=env: jax.lax.scan(lambda s, a: (env.step(s, a), s.reward), s, actions)
         )(first)
         for env in (c, mjx)
@@ -204,11 +205,11 @@ def test_starts_touch_nothing(name):
     env = ours(name)
     model, data = env.physics.model, mujoco.MjData(env.physics.model)
     keys = jax.random.split(jax.random.key(3), 128)
-    starts = np.asarray(jax.jit(jax.vmap(env.domain.start))(keys).qpos)
+    starts = np.asarray(quick.jit(jax.vmap(env.domain.start))(keys).qpos)
     draw = getattr(env.domain, "_place_ball", lambda k: base.random_joints(model, k))
     poses = np.asarray(jax.vmap(draw)(jax.random.clone(keys)))
     pairs = base.touching_pairs(model)
-    gap = jax.jit(lambda p, m: base.least_gap(model, pairs, p, m))
+    gap = quick.jit(lambda p, m: base.least_gap(model, pairs, p, m))
     touching = [_contacts(model, data, q) > 0 for q in starts]
     print(name, "starts that touch:", sum(touching), "of 128")
     assert sum(touching) <= 1
