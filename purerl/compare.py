@@ -124,6 +124,11 @@ def describe(result: dict[str, Any]) -> list[str]:
     if result["versus_first"]:
         lines += ["", f"against {result['versus_first'][0]['baseline']}:"]
         lines += table(versus_rows(result["versus_first"]))
+        if any(v["same_seeds"] for v in result["versus_first"]):
+            lines.append(
+                "Paired: differences between runs of one seed, which begin with the same weights "
+                "if the networks have one shape; the surer figure then."
+            )
     if result["pairs"]:
         lines.append("Runs of one configuration and seed count once, as the first of them.")
     return lines + notes(result["groups"])
@@ -143,9 +148,11 @@ def group_rows(summaries: Iterable[dict[str, Any]]) -> list[list[str]]:
 def versus_rows(against: Iterable[dict[str, Any]]) -> list[list[str]]:
     """Returns the table of groups against the first, its head first."""
     head = ["group", "IQM difference", "95% interval", "P(better)", "95% interval"]
+    head += ["pairs", "paired IQM", "95% interval"]
     rows = [
         [v["label"], number(v["difference"]), interval(v["difference_interval"]),
-         number(v["improvement"]), interval(v["improvement_interval"])]
+         number(v["improvement"]), interval(v["improvement_interval"]),
+         str(v["same_seeds"]), number(v["paired_difference"]), interval(v["paired_interval"])]
         for v in against
     ]  # fmt: skip
     return [head, *rows]

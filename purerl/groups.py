@@ -46,6 +46,9 @@ class Versus(NamedTuple):
     difference_interval: Interval | None
     improvement: float  # probability that a run of this group beats one of the baseline
     improvement_interval: Interval | None
+    same_seeds: int  # runs of this group with a partner of the same seed
+    paired_difference: float | None  # IQM of the differences between partners
+    paired_interval: Interval | None
 
 
 class Curve(NamedTuple):
@@ -158,8 +161,10 @@ def versus(group: Group, baseline: Group, metric: str) -> Versus | None:
     if not ours or not theirs:
         return None
     xs, ys = list(ours.values()), list(theirs.values())
-    if ours.keys() != theirs.keys():
+    alike = ours.keys() == theirs.keys()
+    if not alike:
         xs, ys = [np.concatenate(xs)], [np.concatenate(ys)]
+    pairs = paired_differences(group, baseline, metric, alike)
     return Versus(
         label=group.label,
         baseline=baseline.label,
@@ -167,7 +172,42 @@ def versus(group: Group, baseline: Group, metric: str) -> Versus | None:
         difference_interval=statistics.difference_interval(xs, ys),
         improvement=float(statistics.stratified_probability(xs, ys)),
         improvement_interval=statistics.improvement_interval(xs, ys),
+        same_seeds=sum(map(len, pairs)),
+        paired_difference=float(statistics.pooled_iqm(pairs)) if pairs else None,
+        paired_interval=statistics.iqm_interval(pairs) if pairs else None,
     )
+
+
+def paired_differences(
+    group: Group, baseline: Group, metric: str, alike: bool
+) -> list[statistics.Values]:
+    """Returns differences of score on the seeds that both groups have, [n_k] for each stratum.
+
+    A seed makes the same initial weights in networks of one shape, and they decide much: returns of
+    eight seeds of brax's ant under three versions of the learner correlated by 0.71 to 0.84, and
+    the paired interval was less than half as wide.
+
+    Args:
+      group: the minuend.
+      baseline: the subtrahend.
+      metric: what is compared.
+      alike: whether the groups have the same strata; else all runs of a group are one.
+    """
+    ours, theirs = (by_seed(one, metric, alike) for one in (group, baseline))
+    strata: dict[str, list[float]] = {}
+    for key in sorted(ours.keys() & theirs.keys()):
+        strata.setdefault(key[0], []).append(ours[key] - theirs[key])
+    return [np.array(values) for values in strata.values()]
+
+
+def by_seed(group: Group, metric: str, strata: bool) -> dict[tuple[str, int], float]:
+    """Returns (stratum, or "" for all; seed) -> score, of runs that are the only one there."""
+    found: dict[tuple[str, int], list[float]] = {}
+    for stratum, runs in group.strata.items():
+        for run in runs:
+            if (value := score(run, metric)) is not None:
+                found.setdefault((stratum if strata else "", run.seed), []).append(value)
+    return {key: values[0] for key, values in found.items() if len(values) == 1}
 
 
 def learning_curve(group: Group, metric: str) -> Curve | None:

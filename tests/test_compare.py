@@ -100,6 +100,33 @@ def test_ten_seeds_of_this_against_ten_of_that(tmp_path, capsys):
     assert f"{first['iqm']:.4g}" in said and "P(better)" in said
 
 
+def test_the_same_seeds_are_compared_in_pairs(tmp_path, capsys):
+    """Seeds that decide more than the setting: the interval of pairs sees the setting."""
+    this = np.array([10.0, 20.0, 30.0, 40.0, 50.0, 60.0])
+    gain = np.array([1.0, 2.0, 3.0, 2.0, 1.0, 3.0])
+    make_seeds(tmp_path / "runs", "this", this)
+    # In another order of folders, one seed without a partner, one that did not end.
+    for seed in (5, 3, 1, 0, 2, 4):
+        make_run(tmp_path / "runs" / f"that{9 - seed}", seed, [(this + gain)[seed]] * 4, rate=1.0)
+    make_run(tmp_path / "runs" / "that_alone", 77, [1000.0] * 4, rate=1.0)
+    make_run(tmp_path / "runs" / "this_ends_early", 77, [0.0], rate=1e-3)
+    words = [tmp_path / "runs" / "this*", tmp_path / "runs" / "that*"]
+    (against,) = found(tmp_path, *words)["versus_first"]
+    assert against["baseline"] == "ppo.learning_rate=0.001" and against["same_seeds"] == 6
+    assert against["paired_difference"] == pytest.approx(2.0)  # of 1, 1, 2, 2, 3, 3
+    assert 1.0 <= against["paired_interval"]["low"] < 2.0 < against["paired_interval"]["high"] <= 3
+    assert against["difference_interval"]["low"] < 0
+    assert "Paired: differences" in capsys.readouterr().out
+
+
+def test_other_seeds_have_no_pairs(tmp_path, capsys):
+    make_seeds(tmp_path / "runs", "this", [1.0, 2.0])
+    make_run(tmp_path / "runs" / "that", 9, [5.0] * 4, rate=1.0)
+    (against,) = found(tmp_path, tmp_path / "runs")["versus_first"]
+    assert (against["same_seeds"], against["paired_difference"]) == (0, None)
+    assert "Paired" not in capsys.readouterr().out
+
+
 def test_curves_are_written_as_numbers_and_as_a_picture(tmp_path):
     make_seeds(tmp_path / "runs", "a", [4.0, 8.0, 12.0, 16.0, 40.0])
     found(tmp_path, tmp_path / "runs")
@@ -152,6 +179,9 @@ def test_groups_can_be_chosen_and_what_is_left_aside_makes_strata(tmp_path):
     assert labels == ["ppo.learning_rate=0.001", "ppo.learning_rate=0.003"]
     # Better in all pairs of walk and in 1 of 4 of hop; of all 16 pairs it would be 9.
     assert result["versus_first"][0]["improvement"] == 0.625
+    # Each task with itself: 2, 2, -80, -50.
+    assert result["versus_first"][0]["same_seeds"] == 4
+    assert result["versus_first"][0]["paired_difference"] == -24.0
     labels = [g["label"] for g in found(tmp_path, runs, "--group-by", "experiment")["groups"]]
     assert labels == ["walk", "hop"]
 
