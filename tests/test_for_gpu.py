@@ -11,6 +11,7 @@ from purerl import deterministic, loops
 from purerl.deterministic import trace_deterministic
 from purerl.loops import WRITTEN_OUT, equations
 from purerl.physics import Physics
+from tests import quick
 
 # A ball joint, whose quaternion is put together by parts, and a hinge that its limit stops.
 ARM = """
@@ -126,8 +127,8 @@ def test_a_physics_step_for_a_gpu_is_the_same_step():
     assert named(plain, "scatter")
     assert not named(traced, "scatter")
     assert any(eqn.params["unroll"] == WRITTEN_OUT for eqn in named(traced, "scan"))
-    found = jax.jit(jax.vmap(p.step))(state, ctrl)
-    wanted = jax.jit(jaxpr_as_fun(plain))(*jax.tree.leaves((state, ctrl)))
+    found = quick.jit(jax.vmap(p.step))(state, ctrl)
+    wanted = quick.jit(jaxpr_as_fun(plain))(*jax.tree.leaves((state, ctrl)))
     for x, y in zip(jax.tree.leaves(found), wanted, strict=True):
         scale = max(1.0, float(jnp.abs(y).max(initial=0.0)))
         np.testing.assert_allclose(x / scale, y / scale, atol=1e-6)

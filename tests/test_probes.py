@@ -8,6 +8,7 @@ import pytest
 
 from purerl import gae, losses, networks, normalizer, ppo
 from purerl.rollout import act
+from tests import quick
 from tests.probes import Probe
 
 SMALL = networks.MlpOptions(policy_hidden=(32,), value_hidden=(32,))
@@ -25,8 +26,8 @@ CONFIG = ppo.Config(
 
 
 def train(config, env, network, seed=0):
-    state = jax.jit(partial(ppo.init, config, env, network))(jax.random.key(seed))
-    update = jax.jit(partial(ppo.update, config, env, network), donate_argnums=0)
+    state = quick.jit(partial(ppo.init, config, env, network))(jax.random.key(seed))
+    update = quick.jit(partial(ppo.update, config, env, network), donate_argnums=0)
     for _ in range(config.num_updates):
         state, metrics = update(state)
     return state, metrics
