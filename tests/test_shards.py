@@ -121,12 +121,14 @@ def test_a_run_goes_on_with_another_number_of_devices(toy, tmp_path):
 
 # Sums over 128 samples a shard, which XLA computed otherwise where a device had one shard.
 LARGER = ["--ppo.num-envs", "64", "--ppo.rollout-length", "8", "--ppo.num-steps", "2048"]
+TRAINING = ["--evaluation.number", "0"]
 
 
 @pytest.mark.parametrize("words", [LARGER, ["--ppo.segment-length", "2"]])
 def test_by_default_every_device_has_a_shard(tmp_path, words):
-    said = start(tmp_path, 2, str(TOY), *words, "--name", "default")
-    explicit = start(tmp_path, 1, str(TOY), *words, "--num-shards", "2", "--name", "explicit")
+    words = [str(TOY), *words, *TRAINING]
+    said = start(tmp_path, 2, *words, "--name", "default")
+    explicit = start(tmp_path, 1, *words, "--num-shards", "2", "--name", "explicit")
     assert digest(said) == digest(explicit)
     facts = json.loads((tmp_path / "toy_experiment" / "default" / "manifest.json").read_text())
     assert facts["num_shards"] == facts["devices"] == 2
@@ -135,7 +137,7 @@ def test_by_default_every_device_has_a_shard(tmp_path, words):
 
 def test_the_check_of_a_persons_own_devices():
     """Its short form, on two virtual ones."""
-    words = ["2", "--", str(TOY), *LARGER]  # compiled in the test above
+    words = ["2", "--", str(TOY), *LARGER, *TRAINING]  # compiled in the test above
     said = subprocess.run(
         [sys.executable, "-m", "tests.shards_check", *words],
         cwd=ROOT, env=cached(), stdout=subprocess.PIPE, text=True, check=True, timeout=200,
