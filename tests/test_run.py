@@ -226,8 +226,16 @@ def test_with_xla_on_one_thread_the_cores_do_not_matter(tmp_path):
     assert len({json.loads(line)["digest"] for line in last}) == 1
 
 
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory) -> list[dict]:
+    """The lines of a run that nothing stops."""
+    place = tmp_path_factory.mktemp("undisturbed")
+    assert spawn(place, *LONG).wait(120) == SUCCESS
+    return lines(place)
+
+
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_a_killed_process_resumes_to_the_same_bits(tmp_path, number):
+def test_a_killed_process_resumes_to_the_same_bits(undisturbed, tmp_path, number):
     process = spawn(tmp_path, *LONG)
     wait_for(lambda: len(checkpoints(tmp_path)) >= 3, process)
     process.send_signal(number)
@@ -242,9 +250,7 @@ def test_a_killed_process_resumes_to_the_same_bits(tmp_path, number):
     said, wrong = process.communicate(timeout=120)
     assert process.returncode == SUCCESS, wrong
     assert "Resuming after update" in said
-    process = spawn(tmp_path, *LONG, "--name", "undisturbed")
-    assert process.wait(120) == SUCCESS
-    assert lines(tmp_path) == lines(tmp_path, "undisturbed")
+    assert lines(tmp_path) == undisturbed
     assert digest(tmp_path) in said
 
 
