@@ -2,7 +2,7 @@
 
 Runs of one configuration and seed: the same to the last bit, or the update and the leaf where they
 part. Runs of several seeds: interquartile means with 95% bootstrap intervals, the probability that
-one configuration beats another, learning curves.
+one configuration beats another, differences on the same seeds, learning curves.
 
 Exit codes: 0 compared; 1 two runs that promise the same bits have not; 2 a mistake in the command.
 """
