@@ -120,13 +120,15 @@ def score(run: History, metric: str) -> float | None:
     return curve[max(curve)] if curve and run.status != "unfinished" else None
 
 
+def by_seed(runs: Sequence[History], metric: str) -> dict[int, float]:
+    """Returns seed -> score of the runs of a stratum that count; it has each seed once."""
+    return {run.seed: s for run in runs if (s := score(run, metric)) is not None}
+
+
 def scores(group: Group, metric: str) -> dict[str, np.ndarray]:
     """Returns the scores of the runs that count, [n_k] for each stratum that has any."""
-    found = {
-        key: [s for run in runs if (s := score(run, metric)) is not None]
-        for key, runs in group.strata.items()
-    }
-    return {key: np.array(values) for key, values in found.items() if values}
+    found = {key: by_seed(runs, metric) for key, runs in group.strata.items()}
+    return {key: np.array(list(values.values())) for key, values in found.items() if values}
 
 
 def summarize(group: Group, metric: str) -> Summary:
@@ -161,10 +163,9 @@ def versus(group: Group, baseline: Group, metric: str) -> Versus | None:
     if not ours or not theirs:
         return None
     xs, ys = list(ours.values()), list(theirs.values())
-    alike = ours.keys() == theirs.keys()
-    if not alike:
+    if ours.keys() != theirs.keys():
         xs, ys = [np.concatenate(xs)], [np.concatenate(ys)]
-    pairs = paired_differences(group, baseline, metric, alike)
+    pairs = paired_differences(group, baseline, metric)
     return Versus(
         label=group.label,
         baseline=baseline.label,
@@ -178,36 +179,19 @@ def versus(group: Group, baseline: Group, metric: str) -> Versus | None:
     )
 
 
-def paired_differences(
-    group: Group, baseline: Group, metric: str, alike: bool
-) -> list[statistics.Values]:
-    """Returns differences of score on the seeds that both groups have, [n_k] for each stratum.
+def paired_differences(group: Group, baseline: Group, metric: str) -> list[statistics.Values]:
+    """Returns group's score less baseline's on seeds that both have, [n_k] of each shared stratum.
 
     A seed makes the same initial weights in networks of one shape, and they decide much: returns of
     eight seeds of brax's ant under three versions of the learner correlated by 0.71 to 0.84, and
     the paired interval was less than half as wide.
-
-    Args:
-      group: the minuend.
-      baseline: the subtrahend.
-      metric: what is compared.
-      alike: whether the groups have the same strata; else all runs of a group are one.
     """
-    ours, theirs = (by_seed(one, metric, alike) for one in (group, baseline))
-    strata: dict[str, list[float]] = {}
-    for key in sorted(ours.keys() & theirs.keys()):
-        strata.setdefault(key[0], []).append(ours[key] - theirs[key])
-    return [np.array(values) for values in strata.values()]
-
-
-def by_seed(group: Group, metric: str, strata: bool) -> dict[tuple[str, int], float]:
-    """Returns (stratum, or "" for all; seed) -> score, of runs that are the only one there."""
-    found: dict[tuple[str, int], list[float]] = {}
-    for stratum, runs in group.strata.items():
-        for run in runs:
-            if (value := score(run, metric)) is not None:
-                found.setdefault((stratum if strata else "", run.seed), []).append(value)
-    return {key: values[0] for key, values in found.items() if len(values) == 1}
+    found = []
+    for key in sorted(group.strata.keys() & baseline.strata.keys()):
+        ours, theirs = (by_seed(one.strata[key], metric) for one in (group, baseline))
+        seeds = sorted(ours.keys() & theirs.keys())
+        found.append(np.array([ours[seed] - theirs[seed] for seed in seeds]))
+    return [values for values in found if len(values)]
 
 
 def learning_curve(group: Group, metric: str) -> Curve | None:

@@ -23,9 +23,8 @@ from tests.test_run import ROOT, TOY
 
 CARTPOLE = [str(ROOT / "experiments" / "cartpole_swingup.py"), "--ppo.num-envs", "16"]
 CARTPOLE += ["--ppo.rollout-length", "8", "--ppo.num-steps", "512", "--ppo.num-minibatches", "2"]
-CARTPOLE += ["--evaluation.num-episodes", "2", "--ppo.episode-length", "12"]
-# MJX's evaluation compiles as long as its training.
-EVALUATIONS = {"c": "1", "jax": "0"}
+CARTPOLE += ["--evaluation.number", "1", "--evaluation.num-episodes", "2"]
+CARTPOLE += ["--ppo.episode-length", "12"]
 EIGHT = [str(TOY), "--ppo.num-envs", "16", "--num-shards", "8", "--checkpoints", "3"]
 
 
@@ -96,15 +95,14 @@ def test_a_run_is_the_same_on_any_number_of_devices(toy, tmp_path, devices):
 
 @pytest.mark.parametrize("engine", ["c", "jax"])
 def test_physics_is_the_same_on_any_number_of_devices(tmp_path, engine):
-    words = [*CARTPOLE, "--engine", engine, "--evaluation.number", EVALUATIONS[engine]]
-    words += ["--num-shards", "4"]
+    words = [*CARTPOLE, "--engine", engine, "--num-shards", "4"]
     for devices in (1, 2):
         start(tmp_path, devices, *words, "--name", str(devices))
     if engine == "jax":  # which puts its model on a device: in two processes, each on its own
         both_end(start_two(tmp_path, *words, "--name", "apart"), SUCCESS)
     one, *others = (lines(folder) for folder in sorted((tmp_path / "cartpole_swingup").iterdir()))
     assert len(others) == (2 if engine == "jax" else 1) and all(other == one for other in others)
-    assert one[-1]["train/reward"] > 0 and ("eval/episode_return" in one[-1]) == (engine == "c")
+    assert one[-1]["eval/episode_return"] > 0
 
 
 def test_a_run_goes_on_with_another_number_of_devices(toy, tmp_path):
