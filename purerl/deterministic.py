@@ -13,7 +13,7 @@ which reads the condition, and programs for several devices wait for one another
 
 For a GPU, where a kernel takes microseconds however little it does, there are fewer of them: small
 linear systems have one each (`small_systems.py`), what is put at constant indices is gathered, and
-rounds of innermost loops are written out.
+rounds of innermost loops are written out. What loops read of [n, 3] is handed to them as [3, n].
 """
 
 import functools
@@ -35,7 +35,15 @@ from purerl.folding import (
     known_constant,
     known_literal,
 )
-from purerl.loops import MOST_ROUNDS, WRITTEN_OUT, equations, is_written_out, rounds, sub_jaxprs
+from purerl.loops import (
+    MOST_ROUNDS,
+    WRITTEN_OUT,
+    equations,
+    is_tall,
+    is_written_out,
+    rounds,
+    sub_jaxprs,
+)
 from purerl.ordered_sums import gathered_scatter, ordered_scatter, puts, source
 from purerl.types import Array, PyTree
 
@@ -194,9 +202,15 @@ def _scan(params: dict, inputs: list, known: list[Known], shared: dict) -> list:
     """`lax.scan` with a rewritten body."""
     body, (n, m) = params["jaxpr"], _scan_sizes(params)
     known_body = known[:n] + [None] * (len(inputs) - n)
+    turned = [for_gpu() and is_tall(x) for x in inputs[:n]]
+
+    def turn(consts):
+        return [jnp.transpose(x) if tall else x for x, tall in zip(consts, turned, strict=True)]
+
+    consts = turn(inputs[:n])
 
     def step(carry, x):
-        out = _evaluate(body, known_body, shared, *inputs[:n], *carry, *x)
+        out = _evaluate(body, known_body, shared, *turn(consts), *carry, *x)
         return out[:m], out[m:]
 
     carry, xs = list(inputs[n : n + m]), list(inputs[n + m :])

@@ -1,7 +1,9 @@
 """What a trace tells of a loop before it runs."""
 
 from collections.abc import Iterator
+from typing import Any
 
+import jax.numpy as jnp
 from jax.extend import core
 
 from purerl.folding import Known
@@ -15,6 +17,10 @@ WRITTEN_OUT = 4
 # Equations of a round to be written out. A line search has 300; a whole physics step, 6,000 for six
 # hinges, took three times as long to compile.
 FEW_EQUATIONS = 1000
+# Of what a loop reads XLA leaves the order in memory as it is. Where a line search reads [108, 3],
+# one thread adds the 108 of a column; of [3, 108] a warp does, for all columns in one kernel.
+MANY_ROWS = 32
+FEW_COLUMNS = 4
 
 
 def sub_jaxprs(eqn: core.JaxprEqn) -> list[core.ClosedJaxpr]:
@@ -57,6 +63,11 @@ def is_written_out(eqn: core.JaxprEqn) -> bool:
         return False
     body = eqn.params["jaxpr"]
     return not has_loop(body) and sum(1 for _ in equations(body)) < FEW_EQUATIONS
+
+
+def is_tall(x: Any) -> bool:
+    """Tells whether an array has many rows of few numbers, [n, k]."""
+    return jnp.ndim(x) == 2 and x.shape[1] <= FEW_COLUMNS and x.shape[0] >= MANY_ROWS
 
 
 def rounds(params: dict, known: list[Known]) -> int | None:

@@ -115,6 +115,27 @@ def test_a_long_round_is_not_written_out(monkeypatch):
     assert [e.params["unroll"] for e in named(trace_deterministic(loop, 1.0), "scan")] == [4]
 
 
+def test_a_loop_reads_rows_of_few_numbers_by_column():
+    """As MJX's line search does, which adds up three numbers of each constraint in every round."""
+
+    def search(x):
+        quad = jnp.stack([x * x, x, jnp.cos(x)]).T  # [40, 3]
+        square = x.reshape(5, 8)
+
+        def body(c, _):
+            return (quad * (x > c[0])[:, None]).sum(0) + square.sum(), None
+
+        return jax.lax.scan(body, jnp.zeros(3), None, 9)[0]
+
+    x = jax.random.normal(jax.random.key(0), (2, 40))
+    closed = trace_deterministic(search, x[0])
+    (loop,) = named(closed, "scan")
+    shapes = [v.aval.shape for v in loop.invars]
+    assert (3, 40) in shapes and (40, 3) not in shapes and (5, 8) in shapes
+    (got,) = jax.vmap(jaxpr_as_fun(closed))(x)
+    np.testing.assert_allclose(got, jax.vmap(search)(x), rtol=1e-5)
+
+
 def test_a_physics_step_for_a_gpu_is_the_same_step():
     model = mujoco.MjModel.from_xml_string(ARM)
     p, c = (Physics(model, ("xpos", "cvel"), substeps=3, engine=engine) for engine in ("jax", "c"))
