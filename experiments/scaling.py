@@ -1,13 +1,14 @@
 """How cost grows: steps/s and memory over environments, rollout length, width, cores and seeds.
 
     python -m experiments.scaling --csv docs/scaling.csv
-    python -m experiments.scaling --axes envs --experiment ant_run --engine jax
+    python -m experiments.scaling --engine jax --minibatch 4096 --ppo.num-envs 4096   # on a GPU
 
-One axis varies, the rest stays as the experiment has it; a minibatch holds at most 1024 samples, so
-that the learner's work for a sample is the same everywhere. Each point is a benchmark in a process
-of its own (memory is the most that process held) and times the bare physics in turns with the
-update: the share says what the trainer costs, whatever else the machine was doing. Over seeds, the
-rate is that of all seeds together, one program of vmapped updates.
+One axis varies, the rest stays as the experiment and its overrides have it; a minibatch holds at
+most `--minibatch` samples, so that the learner's work for a sample is the same everywhere. Each
+point is a benchmark in a process of its own (memory is the most that process held) and times the
+bare physics in turns with the update: the share says what the trainer costs, whatever else the
+machine was doing. Over seeds, the rate is that of all seeds together, one program of vmapped
+updates.
 """
 
 import argparse
@@ -20,12 +21,12 @@ import sys
 import tempfile
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
 from experiments.benchmark import compile_part, measure
-from purerl import ppo, rundir
+from purerl import cli, kernels, ppo, run, rundir
 from purerl.errors import UserError, leave, output_file
 from purerl.experiment import Experiment, find
 
@@ -39,18 +40,26 @@ AXES: dict[str, tuple[int, ...]] = {
 }
 FIELDS = ("axis", "value", "steps_per_s", "physics_steps_per_s", "share", "compile_s")
 FIELDS += ("state_mb", "update_mb", "process_mb")
-MINIBATCH = 1024
 SHORT = 8  # steps of a rollout over environments: 16,384 of them take long enough
 
 
-def overrides(axis: str, value: int, config: Any) -> list[str]:
+class Sweep(NamedTuple):
+    """What stays while one axis varies."""
+
+    name: str  # of the experiment
+    words: list[str]  # its overrides, as on the command line
+    config: ppo.Config  # with them
+    minibatch: int  # samples, at most
+
+
+def overrides(axis: str, value: int, config: ppo.Config, minibatch: int) -> list[str]:
     """Returns the options that put one axis at a value."""
     envs = value if axis == "envs" else config.num_envs
     length = {"envs": SHORT, "length": value}.get(axis, config.rollout_length)
     sizes = {
         "num-envs": envs,
         "rollout-length": length,
-        "num-minibatches": max(envs * length // MINIBATCH, 1),
+        "num-minibatches": max(envs * length // minibatch, 1),
     }
     words = [word for name, size in sizes.items() for word in (f"--ppo.{name}", str(size))]
     if axis == "width":
@@ -59,14 +68,14 @@ def overrides(axis: str, value: int, config: Any) -> list[str]:
     return words
 
 
-def point(experiment: Experiment, name: str, engine: str, axis: str, value: int) -> dict[str, Any]:
+def point(sweep: Sweep, axis: str, value: int) -> dict[str, Any]:
     """Measures one point in a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "found.json"
-        command = [sys.executable, "-m", "experiments.benchmark", name, "--engine", engine]
+        command = [sys.executable, "-m", "experiments.benchmark", sweep.name, *sweep.words]
         command += ["--rounds", "2", "--least-s", "0.5", "--json", str(file)]
         command += ["--parts", "physics alone", "update"]
-        command += overrides(axis, value, experiment.ppo)
+        command += overrides(axis, value, sweep.config, sweep.minibatch)
         if run_on(value if axis == "cores" else len(HERE), command):  # it has told why
             raise UserError(f"Measuring {axis} {value} failed; see above.")
         found = json.loads(file.read_text())
@@ -131,21 +140,24 @@ def main(arguments: list[str]) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--axes", nargs="+", choices=tuple(AXES), default=tuple(AXES))
-    parser.add_argument("--experiment", default="ant_run")
+    parser.add_argument("--experiment", default="ant_run", help="takes its overrides, too")
     parser.add_argument("--seeds-experiment", default="cartpole_swingup", help="for the axis seeds")
-    parser.add_argument("--engine", default="auto")
+    parser.add_argument("--minibatch", type=int, default=1024, help="samples, at most")
     parser.add_argument(
         "--csv", type=output_file, default="", help="also write the points to this file"
     )
-    options = parser.parse_args(arguments)
+    options, words = parser.parse_known_args(arguments)
+    kernels.set_flags()  # for seeds, in this process
     seeds = find(options.seeds_experiment).experiment
-    experiment = find(options.experiment).experiment
+    prog = "python -m experiments.scaling"
+    experiment, _ = run.from_command_line(cli.parse, find(options.experiment), words, prog)
+    sweep = Sweep(options.experiment, words, experiment.ppo, options.minibatch)
     rows = []
     for axis, value in [(name, value) for name in options.axes for value in AXES[name]]:
         if axis == "seeds":
-            rows.append(seeds_point(seeds, options.engine, value))
+            rows.append(seeds_point(seeds, experiment.engine, value))
         else:
-            rows.append(point(experiment, options.experiment, options.engine, axis, value))
+            rows.append(point(sweep, axis, value))
         print(table(rows).splitlines()[-1], flush=True)
         if options.csv:  # as they come: a whole table takes minutes
             write(Path(options.csv), rows)

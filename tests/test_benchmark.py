@@ -111,7 +111,7 @@ def test_scaling_changes_one_axis_and_keeps_minibatches(monkeypatch):
     config = find("ant_run").experiment.ppo
 
     def sizes(axis, value):
-        words = scaling.overrides(axis, value, config)
+        words = scaling.overrides(axis, value, config, 1024)
         return dict(zip(words[::2], words[1::2], strict=False))
 
     assert sizes("envs", 16384) == {
@@ -121,7 +121,9 @@ def test_scaling_changes_one_axis_and_keeps_minibatches(monkeypatch):
     }
     assert sizes("envs", 64)["--ppo.num-minibatches"] == "1"
     assert sizes("length", 128)["--ppo.num-minibatches"] == "32"
-    assert scaling.overrides("width", 512, config)[-3:] == ["--network.value-hidden", "512", "512"]
+    assert scaling.overrides("length", 128, config, 4096)[5] == "8"
+    wide = scaling.overrides("width", 512, config, 1024)
+    assert wide[-3:] == ["--network.value-hidden", "512", "512"]
 
 
 def test_a_point_reads_the_benchmark_it_started(monkeypatch):
@@ -134,24 +136,25 @@ def test_a_point_reads_the_benchmark_it_started(monkeypatch):
     }
 
     def run(command, **_):
-        assert command[0] == sys.executable
+        assert command[0] == sys.executable and command[3:6] == ["ant_run", "--seed", "3"]
         with open(command[command.index("--json") + 1], "w") as file:
             json.dump(found, file)
         return SimpleNamespace(returncode=ended)
 
     ended = 0
     monkeypatch.setattr(scaling.subprocess, "run", run)
-    row = scaling.point(find("ant_run").experiment, "ant_run", "c", "envs", 64)
+    sweep = scaling.Sweep("ant_run", ["--seed", "3"], find("ant_run").experiment.ppo, 1024)
+    row = scaling.point(sweep, "envs", 64)
     assert (row["steps_per_s"], row["physics_steps_per_s"], row["share"]) == (150, 200, 0.75)
     assert (row["state_mb"], row["update_mb"], row["process_mb"]) == (2.0, 5.0, 900)
     before = os.sched_getaffinity(0)
     on = []
     monkeypatch.setattr(os, "sched_setaffinity", lambda _, cores: on.append(set(cores)))
-    scaling.point(find("ant_run").experiment, "ant_run", "c", "cores", 1)
+    scaling.point(sweep, "cores", 1)
     assert on == [{min(before)}, before]  # the child's, then one's own again
     ended = 2
     with pytest.raises(UserError, match="envs 64 failed"):
-        scaling.point(find("ant_run").experiment, "ant_run", "c", "envs", 64)
+        scaling.point(sweep, "envs", 64)
 
 
 def test_measuring_one_axis_again_keeps_the_others(tmp_path):
