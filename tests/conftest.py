@@ -13,5 +13,13 @@ import jax  # noqa: E402
 jax.config.update(
     "jax_compilation_cache_dir", os.path.join(tempfile.gettempdir(), "purerl-test-compilations")
 )
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 2.0)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_debug_key_reuse", True)  # a key consumed twice raises
+
+# Files that take a minute or more, the longest first: begun last, one would run alone at the end.
+LONGEST = ("shards", "run", "physics", "seeds", "ppo", "suite", "probes", "kill", "envs")
+
+
+def pytest_collection_modifyitems(items):
+    rank = {f"test_{name}.py": number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.name, len(rank)))

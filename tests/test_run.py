@@ -20,6 +20,7 @@ from purerl import checkpoint, console, errors, launch, recorder, run, rundir, s
 from purerl.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
 from purerl.experiment import Evaluation, find, load
 from purerl.shards import Shards
+from tests import quick
 
 TOY = Path(__file__).parent / "toy_experiment.py"
 ROOT = TOY.parent.parent
@@ -50,7 +51,7 @@ def spawn(runs: Path, *words: str) -> subprocess.Popen:
     return subprocess.Popen(
         [sys.executable, "-m", "purerl.run", str(TOY), "--runs", str(runs), *words],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env=os.environ | {"JAX_COMPILATION_CACHE_DIR": str(runs / "cache")},
+        env=quick.cached(),
     )  # fmt: skip
 
 

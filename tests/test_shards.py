@@ -1,7 +1,6 @@
 """One run on any number of devices, in one process or several: the same bits."""
 
 import json
-import os
 import re
 import signal
 import socket
@@ -18,7 +17,7 @@ import pytest
 from purerl import checkpoint, kernels, normalizer, own_kernels, rundir, shards, spread
 from purerl.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
 from purerl.experiment import Evaluation
-from tests import toy_experiment
+from tests import quick, toy_experiment
 from tests.test_run import ROOT, TOY
 
 CARTPOLE = [str(ROOT / "experiments" / "cartpole_swingup.py"), "--ppo.num-envs", "16"]
@@ -28,39 +27,32 @@ CARTPOLE += ["--ppo.episode-length", "12"]
 EIGHT = [str(TOY), "--ppo.num-envs", "16", "--num-shards", "8", "--checkpoints", "3"]
 
 
-def cached() -> dict[str, str]:
-    """Returns an environment in which all tests' processes share what they compiled."""
-    return os.environ | {
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        "JAX_COMPILATION_CACHE_DIR": jax.config.values["jax_compilation_cache_dir"],
-    }
-
-
-def spawn(runs: Path, devices: int, *words: str) -> subprocess.Popen:
+def spawn(runs: Path, devices: int, *words: str, flags: str = "") -> subprocess.Popen:
     """Starts a run in a process that has so many virtual devices."""
-    flags = f"--xla_force_host_platform_device_count={devices}"
+    flags += " --xla_cpu_multi_thread_eigen=false"
+    flags += f" --xla_force_host_platform_device_count={devices}"
     return subprocess.Popen(
         [sys.executable, "-m", "purerl.run", *words, "--runs", str(runs)],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         # The size of XLA's pool changes bits on a CPU, and it is no smaller than the devices.
-        env=cached() | {"NPROC": "8", "XLA_FLAGS": f"--xla_cpu_multi_thread_eigen=false {flags}"},
+        env=quick.cached() | {"NPROC": "8", "XLA_FLAGS": flags},
     )  # fmt: skip
 
 
-def start(runs: Path, devices: int, *words: str, expect: int = SUCCESS) -> str:
-    process = spawn(runs, devices, *words)
+def start(runs: Path, devices: int, *words: str, expect: int = SUCCESS, flags: str = "") -> str:
+    process = spawn(runs, devices, *words, flags=flags)
     said = process.communicate(timeout=200)[0]
     assert process.returncode == expect, said
     return said
 
 
-def start_two(runs: Path, *words: str) -> list[subprocess.Popen]:
+def start_two(runs: Path, *words: str, flags: str = "") -> list[subprocess.Popen]:
     """Starts a run of two processes with a device each."""
     with socket.socket() as probe:
         probe.bind(("localhost", 0))
         port = probe.getsockname()[1]
     places = [f"localhost:{port},2,{i}" for i in range(2)]
-    return [spawn(runs, 1, *words, "--distributed", place) for place in places]
+    return [spawn(runs, 1, *words, "--distributed", place, flags=flags) for place in places]
 
 
 def both_end(processes: list[subprocess.Popen], code: int) -> list[str]:
@@ -87,19 +79,20 @@ def toy(tmp_path_factory) -> Path:
     return runs / "toy_experiment" / "seed1"
 
 
-@pytest.mark.parametrize("devices", [2, 8])
-def test_a_run_is_the_same_on_any_number_of_devices(toy, tmp_path, devices):
-    start(tmp_path, devices, *EIGHT)
+def test_a_run_is_the_same_on_any_number_of_devices(toy, tmp_path):
+    """On eight; on four and then two, and in two processes, below."""
+    start(tmp_path, 8, *EIGHT)
     assert lines(tmp_path / "toy_experiment" / "seed1") == lines(toy)
 
 
 @pytest.mark.parametrize("engine", ["c", "jax"])
 def test_physics_is_the_same_on_any_number_of_devices(tmp_path, engine):
     words = [*CARTPOLE, "--engine", engine, "--num-shards", "4"]
+    flags = quick.FLAGS if engine == "jax" else ""
     for devices in (1, 2):
-        start(tmp_path, devices, *words, "--name", str(devices))
+        start(tmp_path, devices, *words, "--name", str(devices), flags=flags)
     if engine == "jax":  # which puts its model on a device: in two processes, each on its own
-        both_end(start_two(tmp_path, *words, "--name", "apart"), SUCCESS)
+        both_end(start_two(tmp_path, *words, "--name", "apart", flags=flags), SUCCESS)
     one, *others = (lines(folder) for folder in sorted((tmp_path / "cartpole_swingup").iterdir()))
     assert len(others) == (2 if engine == "jax" else 1) and all(other == one for other in others)
     assert one[-1]["eval/episode_return"] > 0
@@ -122,9 +115,8 @@ LARGER = ["--ppo.num-envs", "64", "--ppo.rollout-length", "8", "--ppo.num-steps"
 TRAINING = ["--evaluation.number", "0"]
 
 
-@pytest.mark.parametrize("words", [LARGER, ["--ppo.segment-length", "2"]])
-def test_by_default_every_device_has_a_shard(tmp_path, words):
-    words = [str(TOY), *words, *TRAINING]
+def test_by_default_every_device_has_a_shard(tmp_path):
+    words = [str(TOY), *LARGER, *TRAINING]
     said = start(tmp_path, 2, *words, "--name", "default")
     explicit = start(tmp_path, 1, *words, "--num-shards", "2", "--name", "explicit")
     assert digest(said) == digest(explicit)
@@ -134,11 +126,11 @@ def test_by_default_every_device_has_a_shard(tmp_path, words):
 
 
 def test_the_check_of_a_persons_own_devices():
-    """Its short form, on two virtual ones."""
-    words = ["2", "--", str(TOY), *LARGER, *TRAINING]  # compiled in the test above
+    """Its short form, on two virtual ones, of segments."""
+    words = ["2", "--", str(TOY), "--ppo.segment-length", "2", *TRAINING]
     said = subprocess.run(
         [sys.executable, "-m", "tests.shards_check", *words],
-        cwd=ROOT, env=cached(), stdout=subprocess.PIPE, text=True, check=True, timeout=200,
+        cwd=ROOT, env=quick.cached(), stdout=subprocess.PIPE, text=True, check=True, timeout=200,
     ).stdout  # fmt: skip
     (one, *_, first), (two, *_, second) = (line.split() for line in said.splitlines()[1:])
     assert (one, two) == ("1", "2") and first == second and len(first) == 16
