@@ -147,11 +147,13 @@ def main(arguments: list[str]) -> int:
         "--csv", type=output_file, default="", help="also write the points to this file"
     )
     options, words = parser.parse_known_args(arguments)
-    kernels.set_flags()  # for seeds, in this process
+    if options.minibatch < 1:
+        parser.error(f"--minibatch is {options.minibatch}; it must be at least 1.")
     seeds = find(options.seeds_experiment).experiment
     prog = "python -m experiments.scaling"
     experiment, _ = run.from_command_line(cli.parse, find(options.experiment), words, prog)
     sweep = Sweep(options.experiment, words, experiment.ppo, options.minibatch)
+    kernels.set_flags()  # for seeds, in this process
     rows = []
     for axis, value in [(name, value) for name in options.axes for value in AXES[name]]:
         if axis == "seeds":

@@ -126,6 +126,16 @@ def test_scaling_changes_one_axis_and_keeps_minibatches(monkeypatch):
     assert wide[-3:] == ["--network.value-hidden", "512", "512"]
 
 
+def test_mistakes_are_told_before_measuring(capsys):
+    for words, said in [
+        (["--minibatch", "0"], "--minibatch is 0; it must be at least 1."),
+        (["--ppo.num-env", "3"], "Did you mean --ppo.num-envs?"),
+    ]:
+        with pytest.raises((SystemExit, UserError)) as raised:
+            scaling.main(["--axes", "envs", *words])
+        assert said in f"{raised.value}{capsys.readouterr().err}"
+
+
 def test_a_point_reads_the_benchmark_it_started(monkeypatch):
     found = {
         "parts": [
