@@ -12,8 +12,6 @@ if jax.__version_info__ < (0, 11):
     OPTIONS["xla_cpu_use_fusion_emitters"] = False
 
 jit = functools.partial(jax.jit, compiler_options=OPTIONS)
-# The same for a process, and how tests' processes share what they compile.
-FLAGS = " ".join(f"--{name}={str(value).lower()}" for name, value in OPTIONS.items())
 
 
 def cached() -> dict[str, str]:
