@@ -51,6 +51,9 @@ _S = mujoco.mjtSensor
 _OF_CONSTRAINTS = (_S.mjSENS_JOINTLIMITPOS, _S.mjSENS_JOINTLIMITVEL, _S.mjSENS_TENDONLIMITPOS)
 _OF_CONSTRAINTS += (_S.mjSENS_TENDONLIMITVEL, _S.mjSENS_GEOMDIST, _S.mjSENS_GEOMNORMAL)
 _OF_CONSTRAINTS += (_S.mjSENS_GEOMFROMTO, _S.mjSENS_CONTACT)
+# Readings for which the places of bodies and their mass are enough.
+_OF_BODIES = ("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos")
+_OF_BODIES += ("geom_xmat", "site_xpos", "site_xmat", "subtree_com", "cinert", "cdof")
 
 
 class WarpEngine:
@@ -70,6 +73,8 @@ class WarpEngine:
         self.shapes = reading_shapes(model, tuple(names))
         self.late_sensors = _late_sensors(model)
         self.massless = model.body_subtreemass < mujoco.mjMINVAL
+        early = {name for name in names if name not in late or name == "sensordata"}
+        self.forward = _bodies if early <= set(_OF_BODIES) else _forward
         free = _unconstrained(model, "sensordata" in names)
         with mjx_defaults():
             self.model, self.free = _put_model(model), _put_model(free)
@@ -113,7 +118,7 @@ class WarpEngine:
 
     def _now(self, state: PyTree, changes: dict[str, Array]) -> mjx.Data:
         """Makes positions and velocities of a batch current, at the least cost."""
-        return _forward(self.free, self._begin(self.free_data, state, changes), changes)
+        return self.forward(self.free, self._begin(self.free_data, state, changes), changes)
 
     def _begin(self, data: mjx.Data, state: PyTree, changes: dict[str, Array]) -> mjx.Data:
         """Returns blank data for a batch, at `state` [B], with room for its contacts."""
@@ -252,6 +257,16 @@ def _place_static_geoms(model: mjx.Model, data: mjx.Data, changes: dict[str, Arr
 def _forward(model: mjx.Model, data: mjx.Data, changes: dict[str, Array]) -> mjx.Data:
     """Runs MJX-Warp's forward dynamics of a batch [B]."""
     return jax.vmap(lambda d, c: mjx.forward(_changed(model, c), d))(data, changes)
+
+
+def _bodies(model: mjx.Model, data: mjx.Data, changes: dict[str, Array]) -> mjx.Data:
+    """Runs its kinematics of a batch [B] alone."""
+
+    def of_one(data: mjx.Data, changes: dict[str, Array]) -> mjx.Data:
+        changed = _changed(model, changes)
+        return mjx.com_pos(changed, mjx.kinematics(changed, data))
+
+    return jax.vmap(of_one)(data, changes)
 
 
 def _over_batch(function: Callable, axes: int = 0) -> Callable:

@@ -47,6 +47,16 @@ def test_it_agrees_with_mujoco_on_every_reading():
         np.testing.assert_allclose(x / scale, y / scale, atol=1e-4)
 
 
+def test_readings_of_bodies_are_those_of_a_whole_forward_pass():
+    p, (state, ctrl) = Physics(biped(), engine_warp._OF_BODIES, 3, "warp"), running()
+    assert p._engine.forward is engine_warp._bodies
+    found, expected = jax.jit(jax.vmap(p.step))(state, ctrl), compiled("warp")[1](state, ctrl)
+    same(found[0], expected[0])
+    same(found[1], [getattr(expected[1], name) for name in engine_warp._OF_BODIES])
+    for others in (("cvel",), ("sensordata",), ("xpos", "ten_length")):
+        assert Physics(biped(), others, 3, "warp")._engine.forward is engine_warp._forward
+
+
 def test_an_ant_meets_the_platforms_of_its_own_corridor_as_in_mujoco():
     """Among its geoms are some that no joint moves and whose place `changes` say."""
     options = run.Options(arena="gaps")
