@@ -12,8 +12,9 @@ once it is done, with the same results: before each round of a `while` a GPU wai
 which reads the condition, and programs for several devices wait for one another.
 
 For a GPU, where a kernel takes microseconds however little it does, there are fewer of them: small
-linear systems have one each (`small_systems.py`), what is put at constant indices is gathered, and
-rounds of innermost loops are written out. What loops read of [n, 3] is handed to them as [3, n].
+linear systems have one each (`small_systems.py`), line searches too (`loop_kernels.py`), what is
+put at constant indices is gathered, and rounds of other innermost loops are written out. What those
+read of [n, 3] is handed to them as [3, n].
 """
 
 import functools
@@ -25,7 +26,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.extend import core
 
-from purerl import small_systems
+from purerl import loop_kernels, small_systems
 from purerl.folding import (
     CALLS,
     Known,
@@ -116,6 +117,7 @@ def _is_rewritten(eqn: core.JaxprEqn) -> bool:
     return (
         _is_unordered(eqn)
         or small_systems.wanted(eqn)
+        or loop_kernels.wanted(eqn)
         or (for_gpu() and (puts(eqn) or is_written_out(eqn)))
         or any(_is_rewritten(inner) for sub in sub_jaxprs(eqn) for inner in sub.jaxpr.eqns)
     )
@@ -180,6 +182,8 @@ def _apply(eqn: core.JaxprEqn, inputs: list, known: list[Known], shared: dict) -
         return [ordered_scatter(eqn, inputs, known)]
     if small_systems.wanted(eqn):
         return small_systems.compute(eqn, inputs)
+    if loop_kernels.wanted(eqn):
+        return loop_kernels.compute(eqn, inputs)
     if name != "while" and not _is_rewritten(eqn):
         return bind_equation(eqn, inputs)
     if puts(eqn) and known[1] is not None:
