@@ -135,21 +135,32 @@ BALLS = """
 """
 
 
-@pytest.mark.parametrize(("cone", "is_kernel"), [("pyramidal", True), ("elliptic", False)])
-def test_the_line_search_of_a_physics_step_is_one_kernel(cone, is_kernel):
-    """But for elliptic cones, whose rounds gather."""
+def physics_of_balls(cone):
+    """Returns their physics for a GPU, states and controls of two, and its trace's kernels."""
     model = mujoco.MjModel.from_xml_string(BALLS.replace("CONE", cone))
     p, c = (Physics(model, ("xpos",), substeps=2, engine=engine) for engine in ("jax", "c"))
     qpos = jnp.array(model.qpos0)[None].repeat(2, 0)
     qvel = jax.random.normal(jax.random.key(0), (2, model.nv))
-    state, _ = jax.vmap(c.init)(qpos, qvel)
-    ctrl = jnp.zeros((2, 0))
+    state, ctrl = jax.vmap(c.init)(qpos, qvel)[0], jnp.zeros((2, 0))
     traced = p._engine.trace(*jax.tree.map(lambda x: x[0], (state, ctrl)), {})
-    loops = [e for e in equations(traced) if e.primitive.name == "pallas_call"]
-    assert any(len(e.outvars) > 8 for e in loops) == is_kernel  # so much a line search carries
-    plain = jax.make_jaxpr(jax.vmap(lambda s, u: p._engine._step(s, u, {})))(state, ctrl)
-    found = quick.jit(jax.vmap(p.step))(state, ctrl)
-    wanted = quick.jit(jaxpr_as_fun(plain))(*jax.tree.leaves((state, ctrl)))
+    return p, (state, ctrl), [e for e in equations(traced) if e.primitive.name == "pallas_call"]
+
+
+def is_search(eqn):
+    return len(eqn.outvars) > 8  # so much it carries, no other kernel writes
+
+
+def test_the_line_search_of_a_physics_step_is_one_kernel():
+    p, args, kernels = physics_of_balls("pyramidal")
+    assert any(map(is_search, kernels))
+    plain = jax.make_jaxpr(jax.vmap(lambda s, u: p._engine._step(s, u, {})))(*args)
+    found = quick.jit(jax.vmap(p.step))(*args)
+    wanted = quick.jit(jaxpr_as_fun(plain))(*jax.tree.leaves(args))
     for x, y in zip(jax.tree.leaves(found), wanted, strict=True):
         scale = max(1.0, float(jnp.abs(y).max(initial=0.0)))
         np.testing.assert_allclose(x / scale, y / scale, atol=1e-5)
+
+
+def test_one_with_elliptic_cones_gathers_and_stays():
+    _, _, kernels = physics_of_balls("elliptic")
+    assert kernels and not any(map(is_search, kernels))
