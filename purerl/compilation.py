@@ -28,7 +28,8 @@ from purerl.experiment import Evaluation
 from purerl.types import Array, Metrics, Network, PyTree, TrainState
 
 # Compiling takes all of few cores, so that the first update waits for whatever is not needed yet;
-# 16 came to a training's first evaluation on a GPU in 22 s with all side by side, in 39 s else.
+# 16 came to brax's ant's first evaluation on a GPU in 22 s with all side by side, in 39 s else (21
+# November 2026, when its program was smaller).
 FEW_CORES = 7
 # LLVM's level on a CPU, 3 elsewhere: what runs once, or is compiled at every start, shall be ready
 # soon. For an ant, `c`, `init` takes 1.5 s of a core instead of 3.3; `collect` 3.9 instead of 4.7

@@ -13,8 +13,8 @@ which reads the condition, and programs for several devices wait for one another
 
 For a GPU, where a kernel takes microseconds however little it does, there are fewer of them: small
 linear systems have one each (`small_systems.py`), line searches too (`loop_kernels.py`), what is
-put at constant indices is gathered, and rounds of other innermost loops are written out. What those
-read of [n, 3] is handed to them as [3, n].
+put at constant indices is gathered, and rounds of other innermost loops are written out. What
+scans read of [n, 3] is handed to them as [3, n].
 """
 
 import functools

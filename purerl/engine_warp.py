@@ -117,7 +117,7 @@ class WarpEngine:
         return state, self._read(self._now(state, changes), data, dropped.astype(jnp.float32))
 
     def _now(self, state: PyTree, changes: dict[str, Array]) -> mjx.Data:
-        """Makes positions and velocities of a batch current, at the least cost."""
+        """Makes what the readings of a batch need current, at the least cost."""
         return self.forward(self.free, self._begin(self.free_data, state, changes), changes)
 
     def _begin(self, data: mjx.Data, state: PyTree, changes: dict[str, Array]) -> mjx.Data:

@@ -3,7 +3,7 @@
 On a GPU, XLA by default times several kernels for an operation and takes the fastest. Two processes
 may choose differently, and other kernels add in another order. Untimed, cuBLAS's own choice is good
 where a product is large enough (`slices.count_slices`); XLA's Triton products, of one untimed tile
-size, are not (slower: a humanoid's physics by 9%, a gradient step by half; H100, jax 0.11.2). Of
+size, are not (slower: a rodent's physics by 10%, a gradient step by half; H100, jax 0.11.2). Of
 reductions it is the other way round: XLA's own are slow untimed, and it takes Triton's by rule when
 told to (a humanoid's physics faster by 9%, that of ants over gaps by 12%; ants on a floor, rodents
 and the learner alike).

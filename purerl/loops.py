@@ -12,7 +12,8 @@ from purerl.folding import Known
 # default is 100 iterations, of which a cartpole needs two.
 MOST_ROUNDS = 16
 # Rounds written out one after another on a GPU, where every round copies what the loop carries: an
-# ant's physics alone was faster by 9%, its four rounds of line search written out (H100).
+# ant's physics alone was faster by 9%, its four rounds of line search written out (H100). That is
+# where `loop_kernels` does not take the loop.
 WRITTEN_OUT = 4
 # Equations of a round to be written out. A line search has 300; a whole physics step, 6,000 for six
 # hinges, took three times as long to compile.
@@ -57,7 +58,7 @@ def is_loop(eqn: core.JaxprEqn) -> bool:
 def is_written_out(eqn: core.JaxprEqn) -> bool:
     """Tells whether rounds of a loop pay written out: a short scan with no loop inside.
 
-    As MJX's line search is.
+    As MJX's line search is, where it is not one kernel (`loop_kernels`).
     """
     if eqn.primitive.name != "scan" or eqn.params["unroll"] > 1:
         return False

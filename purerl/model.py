@@ -95,15 +95,6 @@ def scale_action(model: mujoco.MjModel, action: Array) -> Array:
     return low + 0.5 * (action + 1.0) * (high - low)
 
 
-def use_pyramidal_cone(model: mujoco.MjModel) -> None:
-    """Takes the pyramidal friction cone, on every engine.
-
-    The elliptic one is dm_control's default, and costs MJX a loop over all contacts in each
-    solver iteration; a model must have one physics, whatever the engine.
-    """
-    model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-
-
 def limit_solver(model: mujoco.MjModel, iterations: int, line_search: int) -> None:
     """Bounds Newton's iterations.
 
@@ -112,8 +103,3 @@ def limit_solver(model: mujoco.MjModel, iterations: int, line_search: int) -> No
     """
     model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
     model.opt.iterations, model.opt.ls_iterations = iterations, line_search
-
-
-def disable_sensors(model: mujoco.MjModel) -> None:
-    """Switches off sensors that nothing reads: rangefinders and touch cost time in each substep."""
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)

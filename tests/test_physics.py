@@ -436,7 +436,7 @@ def step_trace(model, rewritten, readings=("xpos", "subtree_com", "cvel")):
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
 def test_no_scatter_sum_is_left_in_a_humanoid(jacobian):
     model = suite.load("humanoid", "run").physics.model.ptr
-    lookup.use_pyramidal_cone(model)
+    model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     model.opt.jacobian = {"dense": 0, "sparse": 1}[jacobian]
     assert len(list_scatter_sums(step_trace(model, rewritten=False))) > 20
     assert not list_scatter_sums(step_trace(model, rewritten=True))
