@@ -6,6 +6,7 @@ share one program, whose bits depend on their number (`seeds.py`).
 """
 
 import functools
+import sys
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
@@ -100,6 +101,8 @@ def execute(
             train_together(folders, seeds, plan, programs, abstract, facts, options, loggers, stop)
         except RunError as error:  # the seeds after it can still be trained
             failed.append(str(error))
+            if len(groups) > 1:  # they may take long, or be stopped
+                print(f"purerl: {error}", file=sys.stderr, flush=True)
     if failed:
         raise RunError(" ".join(failed))
 

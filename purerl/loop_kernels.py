@@ -3,8 +3,8 @@
 In every round MJX's line search adds up three numbers of each constraint, for three points, and
 chooses between them. XLA makes four kernels of a round, and each waits for the one before. Here one
 warp makes all rounds of an environment: what they read and carry stays in its registers. What it
-computes is the trace of the loop's body, equation by equation, whatever MJX writes there; where
-there is no rule for one of them, the loop stays XLA's.
+computes is the trace of the loop's body, equation by equation; where there is no rule for one of
+them, the loop stays XLA's (elliptic cones, equalities, friction in joints or tendons).
 
 A value of the trace is an object array of the same rank. Its entries are numbers or, where one of
 its axes is the long one (size 1 here), vectors along it, [m]: m is the next power of 2 from n on.
@@ -14,7 +14,7 @@ import functools
 import math
 import operator
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -54,10 +54,14 @@ def _long_size(body: core.ClosedJaxpr) -> int | None:
     """Returns n; None if there is no long axis or more than one, or an equation without a rule."""
     shapes = {_shape(v) for v in body.jaxpr.invars}
     for closed in _with_inner(body):
+        if any(n > SHORT for const in closed.consts for n in np.shape(const)):
+            return None
         for eqn in closed.jaxpr.eqns:
             if not _has_rule(eqn):
                 return None
             shapes |= {_shape(v) for v in (*eqn.invars, *eqn.outvars)}
+    if any(0 in shape for shape in shapes):
+        return None
     longer = [[n for n in shape if n > SHORT] for shape in shapes]
     sizes = {n for found in longer for n in found}
     one = len(sizes) == 1 and max(map(len, longer)) == 1 and max(sizes) <= LONGEST
@@ -69,11 +73,14 @@ def _shape(atom: Any) -> tuple[int, ...]:
 
 
 def _has_rule(eqn: core.JaxprEqn) -> bool:
-    name, shapes = eqn.primitive.name, [_shape(v) for v in eqn.invars]
-    if name == "dynamic_slice" and (len(shapes[0]) > 1 or eqn.params["slice_sizes"] != (1,)):
+    name, values = eqn.primitive.name, [cast(Any, v.aval) for v in (*eqn.invars, *eqn.outvars)]
+    if name == "dynamic_slice" and (values[0].ndim > 1 or eqn.params["slice_sizes"] != (1,)):
         return False
-    short = all(n <= SHORT for shape in shapes for n in shape)
-    return name in _RULES and (short or name not in _OF_SHORT_AXES)
+    if name == "select_n" and len(eqn.invars) > 3:  # Triton chooses between two
+        return False
+    short = all(n <= SHORT for value in values for n in value.shape)
+    known = name in _RULES and all(value.dtype in _DTYPES for value in values)
+    return known and (short or name not in _OF_SHORT_AXES)
 
 
 def _with_inner(closed: core.ClosedJaxpr) -> Iterable[core.ClosedJaxpr]:
@@ -110,8 +117,10 @@ def _kernel(body: core.ClosedJaxpr, length: int, size: int, *references: Any) ->
     carry = values[len(consts) :]
     shapes = [value.shape for value in carry]
 
-    def step(_: Array, flat: list[Array]) -> list[Array]:
-        return _flat(_evaluate(long, body, *consts, *_values(shapes, flat)))
+    def step(i: Array, flat: list[Array]) -> list[Array]:
+        new = _flat(_evaluate(long, body, *consts, *_values(shapes, flat)))
+        # What a round sets to a number becomes what is carried: a vector, or no literal.
+        return [jnp.where(i >= 0, a, b) for a, b in zip(new, flat, strict=True)]
 
     carry = _values(shapes, lax.fori_loop(0, length, step, _flat(carry)))
     for ref, value in zip(references[number:], carry, strict=True):
@@ -282,8 +291,10 @@ def _called(long: Long, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
     return _evaluate(long, called_jaxpr(eqn), *args)
 
 
-_NAMES = """abs add and convert_element_type div eq ge gt le lt max min mul ne neg not or select_n
-sqrt square sub""".split()  # noqa: SIM905
+# Not min and max, of which Triton's lose a NaN.
+_NAMES = """abs add and convert_element_type div eq ge gt le lt mul ne not or select_n sqrt square
+sub""".split()  # noqa: SIM905
+_DTYPES = (jnp.float32, jnp.int32, jnp.bool_)
 _RULES: dict[str, Callable[..., list[Value]]] = {
     **dict.fromkeys(_NAMES, _elementwise),
     "argmin": _argmin,

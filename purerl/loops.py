@@ -104,7 +104,9 @@ def _limits(test: core.Jaxpr) -> list[tuple[core.Var | core.Literal, int]]:
         if eqn.primitive.name in ("or", "convert_element_type"):
             ends += eqn.invars
         elif eqn.primitive.name == "ge" and isinstance(eqn.invars[1], core.Literal):
-            found.append((eqn.invars[0], int(eqn.invars[1].val)))
+            limit = eqn.invars[1].val
+            if jnp.issubdtype(jnp.result_type(limit), jnp.integer):  # 2.5 is no number of rounds
+                found.append((eqn.invars[0], int(limit)))
     return found
 
 

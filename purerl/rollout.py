@@ -255,11 +255,14 @@ def _policy_step(
     truncation_value = truncation_values(
         network, state.params, state.normalizer, env_state, memory, truncated
     )
+    # A fresh start may itself be NaN, and 0 times NaN is no 0.
+    seen = carry.env.observation, raw, distribution.log_prob(output.distribution, raw), output.value
+    observation, raw, log_prob, value = select(lost, jax.tree.map(jnp.zeros_like, seen), seen)
     transition = Transition(
-        observation=carry.env.observation,
+        observation=observation,
         raw_action=raw,
-        log_prob=distribution.log_prob(output.distribution, raw),
-        value=output.value,
+        log_prob=log_prob,
+        value=value,
         reward=reward,
         discounted_return=discounted_return,
         terminated=terminated,

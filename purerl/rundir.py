@@ -106,6 +106,7 @@ def check_new_or_resume(folders: Iterable[Path], resume: bool) -> None:
         if is_run and not resume:
             raise UserError(f"The run {folder} exists; use --resume to go on, or another --name.")
         strange = {path.name for path in folder.iterdir()} - OURS if folder.is_dir() else set()
+        strange -= {_draft(folder / name).name for name in OURS}  # of a run killed while starting
         if strange and not is_run:
             raise UserError(f"{folder} is no run (it holds {min(strange)}); use another --name.")
 
@@ -233,9 +234,13 @@ def read_json(path: Path) -> dict[str, Any]:
         raise UserError(f"{path} cannot be read: {one_line(error)}") from error
 
 
+def _draft(path: Path) -> Path:
+    return path.with_name(f".{path.name}.draft")
+
+
 def write_json(path: Path, value: dict[str, Any]) -> None:
     """Writes a JSON file whole or not at all."""
-    draft = path.with_name(f".{path.name}.draft")
+    draft = _draft(path)
     try:
         draft.write_text(json.dumps(value, indent=2) + "\n")
         draft.replace(path)

@@ -39,7 +39,7 @@ def search(x):
     def body(c):
         place, best, going = c
         sums = (quad * (x > place)[:, None]).sum(0) + jnp.array([1.0, 2.0, 3.0])
-        cost = jnp.stack([sums[1], sums[0] * place, -sums[2]])
+        cost = jnp.stack([sums[1], sums[0] * place, 0.0 - sums[2]])
         index = jnp.argmin(jnp.where(jnp.abs(cost) < 50.0, cost, jnp.inf))
         new = jax.lax.cond(going, lambda: place + 0.1 * cost[index], lambda: place - 0.3)
         return new, best + (cost < sums).astype(jnp.int32), (cost > 0.0).any() & (new < 1.0)
@@ -57,11 +57,22 @@ def carried(x):
     return loop(body, (jnp.stack([x, 2.0 * x]), x))
 
 
+def replaced(x):
+    """Rounds set what they carry to numbers: a vector, a number, truth."""
+
+    def body(c):
+        vector, number, truth, total = c
+        total = total + number * vector.sum() / N + truth.astype(jnp.float32)
+        return jnp.full(N, total), jnp.float32(2.0), jnp.array(True), total
+
+    return loop(body, (x, x[0], x[1] > 0.0, jnp.float32(0.1)))
+
+
 def not_numbers(x):
     """The first of several NaNs is the least, an index beyond the end the end's."""
 
     def body(c):
-        some = jnp.stack([c, c * jnp.inf - c * jnp.inf, jnp.sqrt(-c - 1.0)])
+        some = jnp.stack([c, c * jnp.inf - c * jnp.inf, jnp.sqrt(-1.0 - c)])
         return c + jnp.argmin(some) + x.sum() * 0.0
 
     return loop(body, jnp.float32(0.5), 3)
@@ -71,7 +82,7 @@ def arithmetic(x):
     """All that a round may compute beside what `search` does."""
 
     def body(c):
-        least, most = jnp.minimum(c, x), jnp.maximum(-c, x)
+        least, most = jnp.where(c < x, c, x), jnp.where(c > x, 0.0 - c, x)
         root = jnp.sqrt(jnp.square(least)) / (1.0 + jnp.abs(most))
         kept = (least <= most) & ~(root >= 1.0) | (x == c) & (x != most)
         spread = jnp.broadcast_to(c * 0.1, (N,)).sum()  # of a number that stands for all
@@ -80,7 +91,7 @@ def arithmetic(x):
     return loop(body, jnp.float32(0.3))
 
 
-FUNCTIONS = (search, carried, not_numbers, arithmetic)
+FUNCTIONS = (search, carried, replaced, not_numbers, arithmetic)
 
 
 @pytest.mark.parametrize("function", FUNCTIONS)
@@ -92,6 +103,16 @@ def test_a_loop_is_one_kernel(function):
     for ours, theirs in zip(got, want, strict=True):
         assert ours.dtype == theirs.dtype
         np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.skipif(jax.__version_info__ >= (0, 11), reason="it asks a GPU what it is")
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_triton_takes_it(monkeypatch, function):
+    """Interpreted, a kernel may do what it may not on a GPU."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    x = jnp.zeros((3, N))
+    traced = jax.jit(jax.vmap(jaxpr_as_fun(trace_deterministic(function, x[0])))).trace(x)
+    assert "triton" in traced.lower(lowering_platforms=("cuda",)).as_text()
 
 
 def test_every_rule_is_in_a_loop_of_these():
@@ -106,6 +127,20 @@ LOOPS = {
     "none": lambda x: loop(lambda c: c + x[0], 0.0),
     "too long": lambda x: loop(lambda c: c + jnp.tile(x, 20).sum(), 0.0),
     "no rule": lambda x: loop(lambda c: c + jnp.sort(x).sum(), 0.0),
+    "a long constant of a function inside": lambda x: loop(
+        lambda c: c + jax.jit(lambda y: (y * np.arange(float(N))).sum())(x) / N**2, 0.0
+    ),
+    "many numbers in a row": lambda x: loop(
+        lambda c: c * 0.5 + (jnp.stack([c] * 5) * x[:5]).sum(), 0.0
+    ),
+    "an axis without entries": lambda x: loop(lambda c: c + (x[:0] * c).sum() + x.sum(), 0.0),
+    "three to choose from": lambda x: loop(
+        lambda c: jax.lax.select_n((c > 0.0).astype(jnp.int32), c + 1.0, c - x.sum(), c), 0.0
+    ),
+    "other numbers": lambda x: loop(
+        lambda c: c + (x > 0.0).astype(jnp.int16).sum(dtype=jnp.int16), jnp.int16(1)
+    ),
+    "the greater of two": lambda x: loop(lambda c: jnp.maximum(c, x.sum()), 0.0),
     "along the long axis": lambda x: loop(lambda c: c + jnp.argmin(x * c), 0.0),
     "what each round reads": lambda x: jax.lax.scan(lambda c, y: (c + x.sum(), y), 0.0, x)[0],
     "what each round writes": lambda x: jax.lax.scan(lambda c, _: (c + x.sum(), c), 0.0, None, 3),

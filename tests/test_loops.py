@@ -56,6 +56,9 @@ def test_the_count_may_begin_anywhere_that_is_known():
         lambda x: newton(x, limit=x.astype(jnp.int32)),
         lambda x: newton(x, limit=100),  # which it does not reach: a scan would
         lambda x: jax.lax.while_loop(lambda y: ~(y >= 5.0), lambda y: y * 2 + 1, x),
+        # A limit between two numbers, and one that is none.
+        lambda x: newton(x, start=0.0, limit=LIMIT - 0.5, step=1.0),
+        lambda x: newton(x, start=0.0, limit=jnp.inf, step=1.0),
     ],
 )
 def test_other_loops_stay(loop):

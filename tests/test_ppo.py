@@ -329,6 +329,27 @@ def test_action_repeat_stops_at_the_end_of_an_episode():
     np.testing.assert_array_equal(finished.metrics["moves_count"] / finished.episodes, LENGTH)
 
 
+@dataclasses.dataclass(frozen=True)
+class BadStarts(Walk):
+    """One of five starts is NaN."""
+
+    def reset(self, key):
+        state = super().reset(key)
+        x = jnp.where(jnp.abs(state.physics["x"]) > 0.4, jnp.nan, state.physics["x"])
+        return self.state(x, jnp.zeros(()), x)
+
+
+@pytest.mark.parametrize("recurrent", [False, True])
+def test_a_start_that_is_no_number_costs_its_own_step_alone(recurrent):
+    env, network, state = setup(env=BadStarts(), recurrent=recurrent)
+    for _ in range(3):
+        state, metrics = UPDATE(CONFIG, env, network, state)
+        assert metrics["nonfinite_resets"] > 0 and metrics["skipped_minibatches"] == 0
+        assert all(np.isfinite(x) for x in metrics.values())
+    for leaf in jax.tree.leaves((state.params, state.optimizer, state.normalizer)):
+        assert np.isfinite(np.asarray(leaf, np.float64)).all()
+
+
 def test_a_blown_up_environment_is_contained():
     """Environment 3 goes NaN: counted, reset, weight 0; the others' bits are the same."""
     sound_env, network, state = setup()

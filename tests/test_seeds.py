@@ -7,8 +7,8 @@ from pathlib import Path
 import jax
 import pytest
 
-from purerl import checkpoint, compilation, recorder, run, snapshot
-from purerl.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
+from purerl import checkpoint, compilation, launch, recorder, run, snapshot
+from purerl.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE, RunError, UserError
 from tests.test_run import ROOT, TOY, Stopper, digest, folder, lines, start
 
 CARTPOLE = ["--ppo.num-envs", "4", "--ppo.rollout-length", "8", "--ppo.num-steps", "128"]
@@ -42,6 +42,15 @@ def stop_after(monkeypatch):
 
 def kept(runs: Path, seed: str) -> list[int]:
     return checkpoint.updates(folder(runs, seed) / "checkpoints")
+
+
+def test_a_mapped_seed_that_fails_is_told_before_the_next_one(tmp_path, monkeypatch, capsys):
+    def fail(_folders, seeds, *_):
+        raise RunError("It diverged.") if seeds == [1] else UserError("Enough.")
+
+    monkeypatch.setattr(launch, "train_together", fail)
+    assert start(tmp_path, "--num-seeds", "2", "--seeds-by", "map") == USAGE
+    assert capsys.readouterr().err.splitlines() == ["purerl: It diverged.", "purerl: Enough."]
 
 
 @pytest.mark.parametrize(

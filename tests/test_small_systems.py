@@ -125,3 +125,13 @@ def test_a_system_inside_of_what_cannot_be_rewritten_is_left_to_the_library(monk
     assert "cholesky" in str(traced)
     (found,) = jaxpr_as_fun(traced)(matrix, side)
     assert close(found, np.linalg.solve(matrix.astype(np.float64), side))
+
+
+def test_without_tritons_part_of_pallas_there_are_no_kernels_of_our_own(monkeypatch):
+    def gone(name):
+        raise ModuleNotFoundError(f"No module named {name}")
+
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert own_kernels.can_run()
+    monkeypatch.setattr(own_kernels.importlib.util, "find_spec", gone)
+    assert not own_kernels.can_run()
