@@ -74,7 +74,7 @@ class WarpEngine:
         self.late_sensors = _late_sensors(model)
         self.massless = model.body_subtreemass < mujoco.mjMINVAL
         early = {name for name in names if name not in late or name == "sensordata"}
-        self.forward = _bodies if early <= set(_OF_BODIES) else _forward
+        self.forward = _bodies if early <= set(_OF_BODIES) else mjx.forward
         free = _unconstrained(model, "sensordata" in names)
         with mjx_defaults():
             self.model, self.free = _put_model(model), _put_model(free)
@@ -97,7 +97,7 @@ class WarpEngine:
         now = self._now(state, changes)
         data = now
         if self.late:
-            data = _forward(self.model, self._begin(self.data, state, changes), changes)
+            data = _run(mjx.forward, self.model, self._begin(self.data, state, changes), changes)
         return self._read(now, data, jnp.zeros(state.time.shape))
 
     def _step(self, state: PyTree, ctrl: Array, changes: dict[str, Array]) -> tuple[PyTree, tuple]:
@@ -105,7 +105,7 @@ class WarpEngine:
         data = self._begin(self.data, state, changes).replace(ctrl=ctrl)
 
         def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
-            return jax.vmap(lambda d, c: mjx.step(_changed(self.model, c), d))(data, changes), None
+            return _run(mjx.step, self.model, data, changes), None
 
         data, _ = jax.lax.scan(substep, data, None, self.substeps)
         dropped = (data._impl.overflow & _DROPPED) != 0
@@ -118,7 +118,7 @@ class WarpEngine:
 
     def _now(self, state: PyTree, changes: dict[str, Array]) -> mjx.Data:
         """Makes what the readings of a batch need current, at the least cost."""
-        return self.forward(self.free, self._begin(self.free_data, state, changes), changes)
+        return _run(self.forward, self.free, self._begin(self.free_data, state, changes), changes)
 
     def _begin(self, data: mjx.Data, state: PyTree, changes: dict[str, Array]) -> mjx.Data:
         """Returns blank data for a batch, at `state` [B], with room for its contacts."""
@@ -254,19 +254,16 @@ def _place_static_geoms(model: mjx.Model, data: mjx.Data, changes: dict[str, Arr
     )
 
 
-def _forward(model: mjx.Model, data: mjx.Data, changes: dict[str, Array]) -> mjx.Data:
-    """Runs MJX-Warp's forward dynamics of a batch [B]."""
-    return jax.vmap(lambda d, c: mjx.forward(_changed(model, c), d))(data, changes)
+def _run(
+    function: Callable, model: mjx.Model, data: mjx.Data, changes: dict[str, Array]
+) -> mjx.Data:
+    """Calls a function of MJX-Warp's model and data for a batch [B], whose models may differ."""
+    return jax.vmap(lambda d, c: function(_changed(model, c), d))(data, changes)
 
 
-def _bodies(model: mjx.Model, data: mjx.Data, changes: dict[str, Array]) -> mjx.Data:
-    """Runs its kinematics of a batch [B] alone."""
-
-    def of_one(data: mjx.Data, changes: dict[str, Array]) -> mjx.Data:
-        changed = _changed(model, changes)
-        return mjx.com_pos(changed, mjx.kinematics(changed, data))
-
-    return jax.vmap(of_one)(data, changes)
+def _bodies(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Makes what `_OF_BODIES` names current, and no more."""
+    return mjx.com_pos(model, mjx.kinematics(model, data))
 
 
 def _over_batch(function: Callable, axes: int = 0) -> Callable:

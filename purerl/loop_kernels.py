@@ -24,7 +24,7 @@ from jax.extend import core
 
 from purerl import own_kernels
 from purerl.folding import CALLS, called_jaxpr
-from purerl.loops import sub_jaxprs
+from purerl.loops import equations, sub_jaxprs
 from purerl.types import Array
 
 SHORT = 4  # entries of any other axis, at most
@@ -52,15 +52,15 @@ def wanted(eqn: core.JaxprEqn) -> bool:
 
 def _long_size(body: core.ClosedJaxpr) -> int | None:
     """Returns n; None if there is no long axis or more than one, or an equation without a rule."""
+    if not all(map(_has_rule, equations(body))):
+        return None
+    traced = list(equations(body))
+    inner = [sub for eqn in traced for sub in sub_jaxprs(eqn)]
+    consts = [np.shape(const) for closed in (body, *inner) for const in closed.consts]
     shapes = {_shape(v) for v in body.jaxpr.invars}
-    for closed in _with_inner(body):
-        if any(n > SHORT for const in closed.consts for n in np.shape(const)):
-            return None
-        for eqn in closed.jaxpr.eqns:
-            if not _has_rule(eqn):
-                return None
-            shapes |= {_shape(v) for v in (*eqn.invars, *eqn.outvars)}
-    if any(0 in shape for shape in shapes):
+    shapes |= {_shape(v) for eqn in traced for v in (*eqn.invars, *eqn.outvars)}
+    long_const = any(n > SHORT for shape in consts for n in shape)
+    if long_const or any(0 in shape for shape in shapes):
         return None
     longer = [[n for n in shape if n > SHORT] for shape in shapes]
     sizes = {n for found in longer for n in found}
@@ -81,13 +81,6 @@ def _has_rule(eqn: core.JaxprEqn) -> bool:
     short = all(n <= SHORT for value in values for n in value.shape)
     known = name in _RULES and all(value.dtype in _DTYPES for value in values)
     return known and (short or name not in _OF_SHORT_AXES)
-
-
-def _with_inner(closed: core.ClosedJaxpr) -> Iterable[core.ClosedJaxpr]:
-    yield closed
-    for eqn in closed.jaxpr.eqns:
-        for sub in sub_jaxprs(eqn):
-            yield from _with_inner(sub)
 
 
 def compute(eqn: core.JaxprEqn, inputs: Sequence[Array]) -> list[Array]:

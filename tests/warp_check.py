@@ -54,7 +54,7 @@ def test_readings_of_bodies_are_those_of_a_whole_forward_pass():
     same(found[0], expected[0])
     same(found[1], [getattr(expected[1], name) for name in engine_warp._OF_BODIES])
     for others in (("cvel",), ("sensordata",), ("xpos", "ten_length")):
-        assert Physics(biped(), others, 3, "warp")._engine.forward is engine_warp._forward
+        assert Physics(biped(), others, 3, "warp")._engine.forward is engine_warp.mjx.forward
 
 
 def test_an_ant_meets_the_platforms_of_its_own_corridor_as_in_mujoco():
