@@ -4,11 +4,12 @@ It runs on a CPU too, slowly: that is for tests. There it is exact; on a GPU its
 atomics, in any order.
 
 What is batched here is the control step, not the physics step: `vmap` of a control step becomes
-one loop of substeps around MJX-Warp's own batch (the other way round was 1.7 times slower), and
-the size of the batch, which one simulation cannot know, decides how much room contacts get.
+one call for MJX-Warp's own batch (`warp_batch.py`), and the size of the batch, which one simulation
+cannot know, decides how much room contacts get.
 """
 
 import copy
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
@@ -23,27 +24,18 @@ warp.config.log_level = warp.LOG_ERROR  # or it lists its devices, and each of s
 warp.init()
 
 from mujoco.mjx._src import math as mjx_math  # noqa: E402
-from mujoco.mjx.third_party.mujoco_warp import OverflowType  # noqa: E402
-from mujoco.mjx.warp.types import _BATCH_DIM  # noqa: E402
+from mujoco.mjx.third_party import mujoco_warp as mjw  # noqa: E402
 
-from purerl.engine_jax import (  # noqa: E402
-    field_of,
-    load_state,
-    make_data,
-    mjx,
-    mjx_defaults,
-    put_model,
-    reading_shapes,
-    save_state,
-)
+from purerl.engine_jax import mjx_defaults, reading_shapes  # noqa: E402
 from purerl.model import unknown_name  # noqa: E402
 from purerl.types import Array, PyTree  # noqa: E402
+from purerl.warp_batch import Batch, Shapes, Stage, make_call, put_model  # noqa: E402
 
 # Room in the buffers: what the model can need at most, but no more than this for a simulation.
 MOST_CONTACTS = 128  # simulations share it: one may have all contacts that the model allows
 MOST_ROWS = 512  # of constraints; each simulation has its own
 # Running out of iterations is the solver's setting; everything else drops something.
-_DROPPED = ~int(OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS)
+_DROPPED = ~int(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS)
 
 _GEOM = mujoco.mjtGeom
 _ONE_POINT = (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_ELLIPSOID)
@@ -54,6 +46,8 @@ _OF_CONSTRAINTS += (_S.mjSENS_GEOMFROMTO, _S.mjSENS_CONTACT)
 # Readings for which the places of bodies and their mass are enough.
 _OF_BODIES = ("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos")
 _OF_BODIES += ("geom_xmat", "site_xpos", "site_xmat", "subtree_com", "cinert", "cdof")
+_INTEGRATED = ("qpos", "qvel", "act", "time", "qacc_warmstart")  # of a PhysicsState
+_PLACES = {"geom_pos", "geom_quat", "body_pos", "body_quat"}
 
 
 class WarpEngine:
@@ -69,20 +63,21 @@ class WarpEngine:
           substeps: physics steps in one control step.
         """
         self.record, self.late, self.substeps = record, late, substeps
-        names = [name for name in record._fields if name != "overflow"]
-        self.shapes = reading_shapes(model, tuple(names))
+        names = tuple(name for name in record._fields if name != "overflow")
+        if "subtree_com" in names:  # `_read` needs both
+            names += ("xipos",)
+        self.shapes = reading_shapes(model, names)
         self.late_sensors = _late_sensors(model)
         self.massless = model.body_subtreemass < mujoco.mjMINVAL
-        early = {name for name in names if name not in late or name == "sensordata"}
-        self.forward = _bodies if early <= set(_OF_BODIES) else mjx.forward
-        free = _unconstrained(model, "sensordata" in names)
-        with mjx_defaults():
-            self.model, self.free = _put_model(model), _put_model(free)
-            self.contacts, self.rows = room(model, self.model)
-            self.data = make_data(model, "warp", naconmax=0, njmax=self.rows)
-            # The model without constraints needs no room for them.
-            own = free.opt.disableflags == model.opt.disableflags
-            self.free_data = self.data if own else make_data(free, "warp", naconmax=0, njmax=0)
+        self.early = tuple(n for n in self.shapes if n not in late or n == "sensordata")
+        self.model = copy.copy(model)
+        # It has no midphase, and refuses a model that switches it off.
+        self.model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
+        self.contacts, self.rows = room(model, _on_host(self.model))
+        sensed = "sensordata" in names and _sense_constraints(model)
+        self.now = _how_to_read(self.early, sensed)
+        self.batches: dict[Any, Batch] = {}
+        self.calls: dict[Any, Callable] = {}
 
     def init(self, state: PyTree, changes: dict[str, Array]) -> tuple:
         """Returns the readings at `state` under no control."""
@@ -94,77 +89,91 @@ class WarpEngine:
 
     def _init(self, state: PyTree, changes: dict[str, Array]) -> tuple:
         """As `init`, of a batch [B]."""
-        now = self._now(state, changes)
-        data = now
-        if self.late:
-            data = _run(mjx.forward, self.model, self._begin(self.data, state, changes), changes)
-        return self._read(now, data, jnp.zeros(state.time.shape))
+        size = state.time.shape[0]
+        late, early = self._call("init", state, jnp.zeros((size, self.model.nu)), changes)
+        return self._read(late, early, jnp.zeros(size))
 
     def _step(self, state: PyTree, ctrl: Array, changes: dict[str, Array]) -> tuple[PyTree, tuple]:
         """As `step`, of a batch [B]."""
-        data = self._begin(self.data, state, changes).replace(ctrl=ctrl)
-
-        def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
-            return _run(mjx.step, self.model, data, changes), None
-
-        data, _ = jax.lax.scan(substep, data, None, self.substeps)
-        dropped = (data._impl.overflow & _DROPPED) != 0
+        late, early = self._call("step", state, ctrl, changes)
+        dropped = (late["overflow"] & _DROPPED) != 0
         # A NaN control would be clipped into the actuator's range.
         lost = ~_finite(state.time.shape[0], (state, ctrl, changes))
         if "overflow" not in self.record._fields:
             lost |= dropped  # nobody looks
-        state = jax.vmap(_lose)(lost, save_state(state, data))
-        return state, self._read(self._now(state, changes), data, dropped.astype(jnp.float32))
+        state = state.replace(**{name: late[name] for name in _INTEGRATED})
+        return jax.vmap(_lose)(lost, state), self._read(late, early, dropped.astype(jnp.float32))
 
-    def _now(self, state: PyTree, changes: dict[str, Array]) -> mjx.Data:
-        """Makes what the readings of a batch need current, at the least cost."""
-        return _run(self.forward, self.free, self._begin(self.free_data, state, changes), changes)
+    def _call(
+        self, name: str, state: PyTree, ctrl: Array, changes: dict[str, Array]
+    ) -> list[dict[str, Array]]:
+        """Runs "init" or "step" of a batch, and returns the fields late and early."""
+        given = {**vars(state), "ctrl": ctrl, **changes}
+        if _PLACES & set(changes):
+            given |= jax.vmap(lambda c: _place_static_geoms(self.model, c))(changes)
+        size, own = state.time.shape[0], tuple(sorted(changes))
+        if (name, size, own) not in self.calls:
+            takes = {field: value.shape[1:] for field, value in given.items()}
+            self.calls[name, size, own] = make_call(
+                name, self._stages(name), takes, size, lambda on: self._batch(on, size, own)
+            )
+        return self.calls[name, size, own](given)
 
-    def _begin(self, data: mjx.Data, state: PyTree, changes: dict[str, Array]) -> mjx.Data:
-        """Returns blank data for a batch, at `state` [B], with room for its contacts."""
-        size = state.time.shape[0]
-        # One simulation may need all that the model allows; many have 128 each to share.
-        number = min(size * self.contacts, max(self.contacts, size * MOST_CONTACTS))
-        number = number if data._impl.njmax else 0
-        impl = data._impl
-        buffers = {
-            k: getattr(impl, k) for k in impl.__dataclass_fields__ if k.startswith("contact__")
-        }
-        # Made while running: as constants they would be a part of the program.
-        buffers = {k: jnp.zeros((number, *v.shape[1:]), v.dtype) for k, v in buffers.items()}
-        data = data.replace(_impl=impl.replace(**buffers, naconmax=number, naccdmax=number))
+    def _stages(self, name: str) -> tuple[Stage, Stage]:
+        """Returns what "init" and "step" run: the physics, then what makes readings current."""
+        late = {n: self.shapes[n] for n in self.late}
+        if name == "init":
+            first = Stage(mjw.forward if late else _nothing, late)
+        else:
+            first = Stage(self._steps, late | self._state_shapes() | {"overflow": ()})
+        return first, Stage(self.now, {n: self.shapes[n] for n in self.early})
 
-        def load(state: PyTree, changes: dict[str, Array]) -> mjx.Data:
-            return _place_static_geoms(self.model, load_state(data, state), changes)
+    def _state_shapes(self) -> Shapes:
+        """Returns the shapes of what a step integrates."""
+        nq, nv, na = self.model.nq, self.model.nv, self.model.na
+        return dict(zip(_INTEGRATED, ((nq,), (nv,), (na,), (), (nv,)), strict=True))
 
-        return jax.vmap(load)(state, changes)
+    def _batch(self, device: Any, size: int, own: tuple[str, ...]) -> Batch:
+        """Returns the batch on a device, of a size and with its own values of fields."""
+        key = device.alias, size, own
+        if key not in self.batches:
+            # One simulation may need all that the model allows; many have 128 each to share.
+            number = min(size * self.contacts, max(self.contacts, size * MOST_CONTACTS))
+            self.batches[key] = Batch(self.model, size, number, self.rows, own)
+        return self.batches[key]
 
-    def _read(self, now: mjx.Data, last: mjx.Data, dropped: Array) -> tuple:
-        """Returns the readings of a batch: those of the last substep, the others from `now`."""
-        found = {"overflow": dropped}
-        for name, shape in self.shapes.items():
-            value = field_of(last if name in self.late else now, name)
-            if name == "sensordata":
-                value = jnp.where(self.late_sensors, value, now.sensordata)
-            if name == "subtree_com":  # MuJoCo's, where there is no mass; MJX-Warp has zero there
-                value = jnp.where(self.massless[:, None], now.xipos, value)
-            found[name] = value.reshape(value.shape[0], *shape).astype(jnp.float32)
+    def _steps(self, model: mjw.Model, data: mjw.Data) -> None:
+        """Runs the physics steps of a control step."""
+        # All that a step would find of the one before but the state, which is given.
+        data.overflow.zero_()
+        data.flex_hessian_valid.zero_()
+        for _ in range(self.substeps):
+            mjw.step(model, data)
+
+    def _read(self, late: dict[str, Array], early: dict[str, Array], dropped: Array) -> tuple:
+        """Returns the readings of a batch: those of the last substep, and the current ones."""
+        found = late | early | {"overflow": dropped}
+        if "sensordata" in found:
+            value = jnp.where(self.late_sensors, late["sensordata"], early["sensordata"])
+            found["sensordata"] = value
+        if "subtree_com" in found:  # MuJoCo's, where there is no mass; MJX-Warp has zero there
+            value = jnp.where(self.massless[:, None], early["xipos"], early["subtree_com"])
+            found["subtree_com"] = value
         return self.record(*(found[name] for name in self.record._fields))
 
 
-def room(model: mujoco.MjModel, on_device: mjx.Model) -> tuple[int, int]:
+def room(model: mujoco.MjModel, put: mjw.Model) -> tuple[int, int]:
     """Returns how many contacts and rows of constraints one simulation gets room for.
 
     The first is all that the model allows (pairs of geoms that can touch, times the points of
     each), the second what all of them, all equalities, limits and frictions need, or `MOST_ROWS`.
     """
-    impl = on_device._impl
     if model.nflex or model.nhfield or (model.geom_type == _GEOM.mjGEOM_SDF).any():
         return MOST_CONTACTS, MOST_ROWS  # as many points as there are cells: no useful bound
-    pairs = np.asarray(impl.nxn_geom_pair_filtered).reshape(-1, 2)
+    pairs = put.nxn_geom_pair_filtered.numpy().reshape(-1, 2)
     contacts = int(_points(model.geom_type[pairs]).sum())
     pyramidal = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
-    each = impl.nmaxpyramid if pyramidal else impl.nmaxcondim
+    each = put.nmaxpyramid if pyramidal else put.nmaxcondim
     # A weld has 6 rows. MJX-Warp drops an equality that would end where the buffer ends: 8 more.
     others = 6 * model.neq + model.nv + 2 * model.ntendon + model.njnt + 8
     rows = contacts * max(1, int(each)) + others
@@ -178,27 +187,51 @@ def _points(types: np.ndarray) -> np.ndarray:
     return np.where(one, 1, np.where(two, 2, 8))
 
 
-def _unconstrained(model: mujoco.MjModel, sensors: bool) -> mujoco.MjModel:
-    """Returns the model without constraints: positions and velocities do not depend on them.
+def _on_host(model: mujoco.MjModel) -> mjw.Model:
+    """Returns MJX-Warp's model on the CPU; ValueError if it cannot simulate it."""
+    try:
+        with warp.ScopedDevice("cpu"):
+            return put_model(model, {})
+    except NotImplementedError as error:
+        raise ValueError(
+            f"MJX-Warp cannot simulate this model: {error} Change the model, or use engine 'c'."
+        ) from error
 
-    But for a few sensors, with which it is the model as it is.
-    """
-    if sensors and np.isin(model.sensor_type, [int(s) for s in _OF_CONSTRAINTS]).any():
-        return model
-    model = copy.copy(model)
+
+def _unconstrained(model: mjw.Model) -> mjw.Model:
+    """Returns the model without constraints: positions and velocities do not depend on them."""
+    model, model.opt = copy.copy(model), copy.copy(model.opt)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     return model
 
 
-def _put_model(model: mujoco.MjModel) -> mjx.Model:
-    """Puts a model on the device; MJX-Warp does not print of overflow, which is a reading.
+def _sense_constraints(model: mujoco.MjModel) -> bool:
+    """Tells if the model has one of the few sensors that sense constraints without forces."""
+    return bool(np.isin(model.sensor_type, [int(s) for s in _OF_CONSTRAINTS]).any())
 
-    It has no midphase, and refuses a model that switches it off.
-    """
-    model = copy.copy(model)
-    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
-    put = put_model(model, "warp")
-    return put.replace(opt=put.opt.replace(_impl=put.opt._impl.replace(warn_overflow=0)))
+
+def _how_to_read(early: tuple[str, ...], constraints_matter: bool) -> Callable:
+    """Returns what makes the early readings current, at the least cost."""
+    if not early:
+        return _nothing
+    if set(early) <= set(_OF_BODIES):
+        return _bodies
+    return mjw.forward if constraints_matter else _forward
+
+
+def _bodies(model: mjw.Model, data: mjw.Data) -> None:
+    """Makes what `_OF_BODIES` names current, and no more."""
+    mjw.kinematics(model, data)
+    mjw.com_pos(model, data)
+
+
+def _forward(model: mjw.Model, data: mjw.Data) -> None:
+    """Makes all that follows from positions and velocities current."""
+    mjw.forward(_unconstrained(model), data)
+
+
+def _nothing(model: mjw.Model, data: mjw.Data) -> None:
+    """Runs no kernel."""
 
 
 def _late_sensors(model: mujoco.MjModel) -> np.ndarray:
@@ -209,12 +242,17 @@ def _late_sensors(model: mujoco.MjModel) -> np.ndarray:
 
 def _known(changes: dict[str, Array]) -> dict[str, Array]:
     """Refuses changes of fields of which MJX-Warp has one value for the whole batch, or none."""
-    fields = [name for name, batched in _BATCH_DIM["Model"].items() if batched]
+    fields = [f.name for f in dataclasses.fields(mjw.Model) if _is_per_simulation(f.type)]
     for name in changes:
         if name not in fields:
             what = "model field that can change on engine 'warp'"
             raise ValueError(unknown_name(what, name, fields))
     return changes
+
+
+def _is_per_simulation(kind: Any) -> bool:
+    """Tells if a field of MJX-Warp's model, of this type, may differ between simulations."""
+    return getattr(kind, "shape", ())[:1] == ("*",)
 
 
 def _finite(size: int, trees: PyTree) -> Array:
@@ -228,42 +266,23 @@ def _lose(lost: Array, state: PyTree) -> PyTree:
     return jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), state)
 
 
-def _changed(model: mjx.Model, changes: dict[str, Array]) -> mjx.Model:
-    """Sets fields of the model; MJX-Warp keeps some in another shape ([n, 2, 3] for [n, 6])."""
-    return model.tree_replace({n: v.reshape(getattr(model, n).shape) for n, v in changes.items()})
+def _place_static_geoms(model: mujoco.MjModel, changes: dict[str, Array]) -> dict[str, Array]:
+    """Puts geoms that no joint moves where `changes` say: MJX-Warp takes their place as given.
 
-
-def _place_static_geoms(model: mjx.Model, data: mjx.Data, changes: dict[str, Array]) -> mjx.Data:
-    """Puts geoms that no joint moves where `changes` say: MJX-Warp takes their place from data."""
-    if not set(changes) & {"geom_pos", "geom_quat", "body_pos", "body_quat"}:
-        return data
-    body_pos, body_quat = (changes.get(n, getattr(model, n)) for n in ("body_pos", "body_quat"))
-    mocap = model.body_mocapid[model.body_rootid] >= 0
-    still = ((model.body_weldid == 0) & ~mocap)[model.geom_bodyid]
-    pos, quat = (changes.get(n, getattr(model, n)) for n in ("geom_pos", "geom_quat"))
-    body = model.geom_bodyid
-    while body.any():  # one body out; the world's frame, which is its own parent, changes nothing
-        pos = body_pos[body] + jax.vmap(mjx_math.rotate)(pos, body_quat[body])
-        quat = jax.vmap(mjx_math.quat_mul)(body_quat[body], quat)
-        body = model.body_parentid[body]
-    return data.replace(
-        geom_xpos=jnp.where(still[:, None], pos, data.geom_xpos),
-        geom_xmat=jnp.where(
-            still[:, None, None], jax.vmap(mjx_math.quat_to_mat)(quat), data.geom_xmat
-        ),
+    Returns:
+      "geom_xpos" [ngeom, 3] [m] and "geom_xmat" [ngeom, 3, 3]; of other geoms they mean nothing.
+    """
+    body_pos, body_quat, pos, quat = (
+        changes.get(name, jnp.asarray(getattr(model, name), jnp.float32))
+        for name in ("body_pos", "body_quat", "geom_pos", "geom_quat")
     )
-
-
-def _run(
-    function: Callable, model: mjx.Model, data: mjx.Data, changes: dict[str, Array]
-) -> mjx.Data:
-    """Calls a function of MJX-Warp's model and data for a batch [B], whose models may differ."""
-    return jax.vmap(lambda d, c: function(_changed(model, c), d))(data, changes)
-
-
-def _bodies(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Makes what `_OF_BODIES` names current, and no more."""
-    return mjx.com_pos(model, mjx.kinematics(model, data))
+    body = model.geom_bodyid
+    with mjx_defaults():
+        while body.any():  # a body out; the world's frame, which is its own parent, changes nothing
+            pos = body_pos[body] + jax.vmap(mjx_math.rotate)(pos, body_quat[body])
+            quat = jax.vmap(mjx_math.quat_mul)(body_quat[body], quat)
+            body = model.body_parentid[body]
+        return {"geom_xpos": pos, "geom_xmat": jax.vmap(mjx_math.quat_to_mat)(quat)}
 
 
 def _over_batch(function: Callable, axes: int = 0) -> Callable:
@@ -277,8 +296,7 @@ def _over_batch(function: Callable, axes: int = 0) -> Callable:
         lead = args[0].time.shape
         number = math.prod(lead)
         flat = jax.tree.map(lambda x: x.reshape(number, *x.shape[axes:]), args)
-        with mjx_defaults():
-            out = function(*flat)
+        out = function(*flat)
         return jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), out)
 
     @call.def_vmap

@@ -16,7 +16,9 @@ from tests.test_physics import NUMBER, biped, compiled, starts, trajectory
 
 pytest.importorskip("warp", reason="engine 'warp' needs warp-lang: pip install -e '.[warp]'")
 
-from purerl import engine_warp  # noqa: E402
+import warp  # noqa: E402
+
+from purerl import engine_warp, warp_batch  # noqa: E402
 from purerl.env import check_env  # noqa: E402
 
 
@@ -49,12 +51,12 @@ def test_it_agrees_with_mujoco_on_every_reading():
 
 def test_readings_of_bodies_are_those_of_a_whole_forward_pass():
     p, (state, ctrl) = Physics(biped(), engine_warp._OF_BODIES, 3, "warp"), running()
-    assert p._engine.forward is engine_warp._bodies
+    assert p._engine.now is engine_warp._bodies
     found, expected = jax.jit(jax.vmap(p.step))(state, ctrl), compiled("warp")[1](state, ctrl)
     same(found[0], expected[0])
     same(found[1], [getattr(expected[1], name) for name in engine_warp._OF_BODIES])
     for others in (("cvel",), ("sensordata",), ("xpos", "ten_length")):
-        assert Physics(biped(), others, 3, "warp")._engine.forward is engine_warp.mjx.forward
+        assert Physics(biped(), others, 3, "warp")._engine.now is engine_warp._forward
 
 
 def test_an_ant_meets_the_platforms_of_its_own_corridor_as_in_mujoco():
@@ -98,6 +100,26 @@ def test_a_blow_up_is_nan_and_touches_no_other():
     ):
         same(*(jax.tree.map(lambda x: x[keep], both) for both in (bad, good)))
         assert np.isnan(bad[0].qvel[2]).any()
+
+
+def test_a_call_leaves_nothing_to_the_next(monkeypatch):
+    """MJX-Warp's data outlives a call: numbers that are NaN, contacts, what found no room."""
+    step, (state, ctrl) = compiled("warp")[1], running()
+    first = step(state, ctrl)
+    step(jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), state), ctrl)
+    same(step(state, ctrl), first)
+    monkeypatch.setattr(engine_warp, "MOST_ROWS", 3)
+    step, state, ctrl = crouching("warp", overflow_reading("warp"))
+    assert step(state, ctrl)[1].overflow.sum() == 3
+    assert not step(jax.tree.map(lambda x: jnp.stack([x[3]] * NUMBER), state), ctrl)[
+        1
+    ].overflow.any()
+
+
+def test_a_field_of_another_size_than_expected_is_refused():
+    batch = warp_batch.Batch(biped(), 2, 8, 64, ())
+    with pytest.raises(ValueError, match="keeps 'qvel' in .* not in 12: this version"):
+        batch.call("step", (), ("qvel",), (warp.zeros(3),))
 
 
 def crouching(engine, readings=()):

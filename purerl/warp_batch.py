@@ -1,0 +1,158 @@
+"""Calls of MJX-Warp's kernels from JAX, for a whole batch of simulations at once.
+
+MJX's own way hands all of its model and data over at each physics step, some 330 arrays. Here they
+stay where MJX-Warp has put them, outside of JAX: a call copies in what a control step begins with,
+runs one CUDA graph of all its physics steps, and copies out what was asked for. (Ants over gaps,
+4,096 on an H100: 1.67 times as fast.)
+
+To JAX a call is a pure function: all that one could leave behind for the next is overwritten.
+"""
+
+import inspect
+import math
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import mujoco
+import warp as wp
+from mujoco.mjx.third_party import mujoco_warp as mjw
+
+from purerl.types import Array
+
+Shapes = dict[str, tuple[int, ...]]  # of fields, for one simulation
+
+
+class Stage(NamedTuple):
+    """A part of a call: kernels, and the fields of the data that are read after them."""
+
+    run: Callable[[mjw.Model, mjw.Data], None]
+    gives: Shapes
+
+
+class Batch:
+    """MJX-Warp's model and data of a batch on one device, and the graphs of its calls."""
+
+    def __init__(
+        self, model: mujoco.MjModel, size: int, contacts: int, rows: int, own: tuple[str, ...]
+    ):
+        """Takes the memory, on Warp's current device.
+
+        Args:
+          model: the model.
+          size: simulations.
+          contacts: room for them, shared by all simulations.
+          rows: room for rows of constraints, of each simulation.
+          own: fields of the model of which each simulation has its own value.
+        """
+        self.model = put_model(model, dict.fromkeys(own, size))
+        self.data = mjw.make_data(model, nworld=size, naconmax=contacts, njmax=rows)
+        self.own = own
+        self.graphs: dict[str, list[Callable[[], None]]] = {}
+
+    def call(
+        self, name: str, stages: tuple[Stage, ...], takes: Iterable[str], arrays: Iterable[wp.array]
+    ) -> None:
+        """Runs a call's stages on the current stream; `arrays`: what it takes, then what it gives.
+
+        Fields without numbers are in neither.
+        """
+        left = iter(arrays)
+        for field in takes:
+            array = next(left)
+            wp.copy(self._numbers(field, array), array)
+        if name not in self.graphs:
+            self.graphs[name] = [self._record(stage) for stage in stages]
+        for stage, graph in zip(stages, self.graphs[name], strict=True):
+            graph()
+            for field in filled(stage.gives):
+                array = next(left)
+                wp.copy(array, self._numbers(field, array))
+
+    def _record(self, stage: Stage) -> Callable[[], None]:
+        """Returns a function that runs a stage: on a GPU one CUDA graph."""
+        if not self.data.qpos.device.is_cuda:
+            return lambda: stage.run(self.model, self.data)
+        with wp.ScopedCapture() as capture:
+            stage.run(self.model, self.data)
+        return lambda: wp.capture_launch(capture.graph)
+
+    def _numbers(self, field: str, like: wp.array) -> wp.array:
+        """Returns a view of a field's numbers, [n] as `like`, whatever vectors they belong to."""
+        array = getattr(self.model if field in self.own else self.data, field)
+        if array.capacity != like.capacity:
+            raise ValueError(
+                f"MJX-Warp keeps {field!r} in {array.capacity} bytes and not in {like.capacity}: "
+                "this version of it is not one that purerl knows."
+            )
+        return wp.array(ptr=array.ptr, dtype=like.dtype, shape=like.shape, device=array.device)
+
+
+def put_model(model: mujoco.MjModel, sizes: dict[str, int]) -> mjw.Model:
+    """Puts a model on Warp's current device, with so many values of some of its fields."""
+    put = mjw.put_model(model, batch_sizes=sizes)
+    put.opt.warn_overflow = 0  # or it prints
+    return put
+
+
+def filled(shapes: Shapes) -> Shapes:
+    """Leaves out the fields that have no numbers."""
+    return {field: shape for field, shape in shapes.items() if math.prod(shape)}
+
+
+def make_call(
+    name: str, stages: tuple[Stage, ...], takes: Shapes, size: int, find: Callable[[Any], Batch]
+) -> Callable[[dict[str, Array]], list[dict[str, Array]]]:
+    """Returns a function for JAX that runs stages on a batch.
+
+    It takes a dict of fields [size, ...] and returns what each stage gives.
+
+    Args:
+      name: of the call; a batch records the graphs of a name once.
+      stages: what is run, and what is read in between.
+      takes: the fields it is given: of the data, or of the model where they are a batch's own.
+      size: simulations.
+      find: returns the batch on one of Warp's devices, the current one. Warp keeps it, and what
+        it holds, as long as the process lasts.
+    """
+    inputs = list(filled(takes))
+    lengths = {
+        (i, field): size * math.prod(shape)
+        for i, stage in enumerate(stages)
+        for field, shape in filled(stage.gives).items()
+    }
+
+    if not lengths:  # Warp refuses a call that gives nothing
+        return lambda _: [{f: jnp.zeros((size, *s)) for f, s in t.gives.items()} for t in stages]
+
+    def run(*arrays: wp.array) -> None:
+        find(wp.get_device()).call(name, stages, inputs, arrays)
+
+    kinds = {f"in_{field}": wp.float32 for field in inputs}
+    kinds |= {f"{f}_{i}": wp.int32 if f == "overflow" else wp.float32 for i, f in lengths}
+    _declare(run, kinds)
+    call = wp.jax_callable(
+        run,
+        num_outputs=len(lengths),
+        output_dims={f"{f}_{i}": length for (i, f), length in lengths.items()},
+        graph_mode=wp.JaxCallableGraphMode.NONE,  # a batch records its own graphs
+    )
+
+    def of_fields(given: dict[str, Array]) -> list[dict[str, Array]]:
+        numbers = call(*(given[field].reshape(-1) for field in inputs))
+        found = dict(zip(lengths, numbers, strict=True))
+        return [
+            {f: found.get((i, f), jnp.zeros(0)).reshape(size, *s) for f, s in stage.gives.items()}
+            for i, stage in enumerate(stages)
+        ]
+
+    return of_fields
+
+
+def _declare(function: Any, kinds: dict[str, Any]) -> None:
+    """Gives a function of any number of arrays [n] the names and types that Warp asks it for."""
+    types = {name: wp.array(dtype=kind, ndim=1) for name, kind in kinds.items()}
+    named = inspect.Parameter.POSITIONAL_OR_KEYWORD
+    parameters = [inspect.Parameter(name, named, annotation=kind) for name, kind in types.items()]
+    function.__signature__ = inspect.Signature(parameters)
+    function.__annotations__ = types
