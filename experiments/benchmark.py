@@ -11,7 +11,7 @@ machine falls on all of them; the median of the rounds counts. Rates are control
 
 Memory: the run's state; one update, its state and what the compiled program needs beside it; and
 the most that the device has held, where it counts, or else the process, everything included (the
-`c` engine's simulations too, which XLA does not see).
+`c` engine's simulations too, which XLA does not see). What `warp` keeps on a GPU is not in it.
 """
 
 import argparse
