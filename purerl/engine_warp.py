@@ -47,6 +47,8 @@ _OF_CONSTRAINTS += (_S.mjSENS_GEOMFROMTO, _S.mjSENS_CONTACT)
 _OF_BODIES = ("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos")
 _OF_BODIES += ("geom_xmat", "site_xpos", "site_xmat", "subtree_com", "cinert", "cdof")
 _INTEGRATED = ("qpos", "qvel", "act", "time", "qacc_warmstart")  # of a PhysicsState
+_SUMS = {"dof_damping", "dof_dampingpoly", "tendon_damping", "tendon_dampingpoly"}
+_SUMS |= {"actuator_gear"}  # of a joint's damping and an actuator's, times its gear squared
 _PLACES = {"geom_pos", "geom_quat", "body_pos", "body_quat"}
 
 
@@ -75,23 +77,24 @@ class WarpEngine:
         self.model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
         self.contacts, self.rows = room(model, _on_host(self.model))
         sensed = "sensordata" in names and _sense_constraints(model)
-        self.now = _how_to_read(self.early, sensed)
+        self.make_current = _how_to_read(self.early, sensed)
         self.batches: dict[Any, Batch] = {}
         self.calls: dict[Any, Callable] = {}
 
     def init(self, state: PyTree, changes: dict[str, Array]) -> tuple:
         """Returns the readings at `state` under no control."""
-        return _over_batch(self._init)(state, _known(changes))
+        return _over_batch(self._init)(state, _known(self.model, changes))
 
     def step(self, state: PyTree, ctrl: Array, changes: dict[str, Array]) -> tuple[PyTree, tuple]:
         """Advances one control step."""
-        return _over_batch(self._step)(state, ctrl, _known(changes))
+        return _over_batch(self._step)(state, ctrl, _known(self.model, changes))
 
     def _init(self, state: PyTree, changes: dict[str, Array]) -> tuple:
         """As `init`, of a batch [B]."""
         size = state.time.shape[0]
-        late, early = self._call("init", state, jnp.zeros((size, self.model.nu)), changes)
-        return self._read(late, early, jnp.zeros(size))
+        none = jnp.zeros((size, self.model.nu), jnp.float32)
+        found = self._combine(*self._call("init", state, none, changes))
+        return self._read(found, jnp.zeros(size, jnp.float32))
 
     def _step(self, state: PyTree, ctrl: Array, changes: dict[str, Array]) -> tuple[PyTree, tuple]:
         """As `step`, of a batch [B]."""
@@ -102,7 +105,8 @@ class WarpEngine:
         if "overflow" not in self.record._fields:
             lost |= dropped  # nobody looks
         state = state.replace(**{name: late[name] for name in _INTEGRATED})
-        return jax.vmap(_lose)(lost, state), self._read(late, early, dropped.astype(jnp.float32))
+        state, found = jax.vmap(_lose)(lost, (state, self._combine(late, early)))
+        return state, self._read(found, dropped.astype(jnp.float32))
 
     def _call(
         self, name: str, state: PyTree, ctrl: Array, changes: dict[str, Array]
@@ -111,13 +115,13 @@ class WarpEngine:
         given = {**vars(state), "ctrl": ctrl, **changes}
         if _PLACES & set(changes):
             given |= jax.vmap(lambda c: _place_static_geoms(self.model, c))(changes)
-        size, own = state.time.shape[0], tuple(sorted(changes))
-        if (name, size, own) not in self.calls:
+        size, changed = state.time.shape[0], tuple(sorted(changes))
+        if (name, size, changed) not in self.calls:
             takes = {field: value.shape[1:] for field, value in given.items()}
-            self.calls[name, size, own] = make_call(
-                name, self._stages(name), takes, size, lambda on: self._batch(on, size, own)
+            self.calls[name, size, changed] = make_call(
+                name, self._stages(name), takes, size, lambda on: self._batch(on, size, changed)
             )
-        return self.calls[name, size, own](given)
+        return self.calls[name, size, changed](given)
 
     def _stages(self, name: str) -> tuple[Stage, Stage]:
         """Returns what "init" and "step" run: the physics, then what makes readings current."""
@@ -126,39 +130,41 @@ class WarpEngine:
             first = Stage(mjw.forward if late else _nothing, late)
         else:
             first = Stage(self._steps, late | self._state_shapes() | {"overflow": ()})
-        return first, Stage(self.now, {n: self.shapes[n] for n in self.early})
+        return first, Stage(self.make_current, {n: self.shapes[n] for n in self.early})
 
     def _state_shapes(self) -> Shapes:
         """Returns the shapes of what a step integrates."""
         nq, nv, na = self.model.nq, self.model.nv, self.model.na
         return dict(zip(_INTEGRATED, ((nq,), (nv,), (na,), (), (nv,)), strict=True))
 
-    def _batch(self, device: Any, size: int, own: tuple[str, ...]) -> Batch:
-        """Returns the batch on a device, of a size and with its own values of fields."""
-        key = device.alias, size, own
+    def _batch(self, device: Any, size: int, changed: tuple[str, ...]) -> Batch:
+        """Returns the batch on a device, of a size and with such changes."""
+        key = device.alias, size, changed
         if key not in self.batches:
             # One simulation may need all that the model allows; many have 128 each to share.
             number = min(size * self.contacts, max(self.contacts, size * MOST_CONTACTS))
-            self.batches[key] = Batch(self.model, size, number, self.rows, own)
+            self.batches[key] = Batch(self.model, size, number, self.rows, changed)
         return self.batches[key]
 
     def _steps(self, model: mjw.Model, data: mjw.Data) -> None:
         """Runs the physics steps of a control step."""
-        # All that a step would find of the one before but the state, which is given.
-        data.overflow.zero_()
-        data.flex_hessian_valid.zero_()
         for _ in range(self.substeps):
             mjw.step(model, data)
 
-    def _read(self, late: dict[str, Array], early: dict[str, Array], dropped: Array) -> tuple:
-        """Returns the readings of a batch: those of the last substep, and the current ones."""
-        found = late | early | {"overflow": dropped}
+    def _combine(self, late: dict[str, Array], early: dict[str, Array]) -> dict[str, Array]:
+        """Returns the fields of a batch: those of the last substep, and the current ones."""
+        found = late | early
         if "sensordata" in found:
             value = jnp.where(self.late_sensors, late["sensordata"], early["sensordata"])
             found["sensordata"] = value
         if "subtree_com" in found:  # MuJoCo's, where there is no mass; MJX-Warp has zero there
             value = jnp.where(self.massless[:, None], early["xipos"], early["subtree_com"])
             found["subtree_com"] = value
+        return {name: found[name] for name in self.shapes}
+
+    def _read(self, found: dict[str, Array], dropped: Array) -> tuple:
+        """Returns the record of readings."""
+        found = found | {"overflow": dropped}
         return self.record(*(found[name] for name in self.record._fields))
 
 
@@ -240,13 +246,20 @@ def _late_sensors(model: mujoco.MjModel) -> np.ndarray:
     return np.repeat(late, model.sensor_dim)
 
 
-def _known(changes: dict[str, Array]) -> dict[str, Array]:
+def _known(model: mujoco.MjModel, changes: dict[str, Array]) -> dict[str, Array]:
     """Refuses changes of fields of which MJX-Warp has one value for the whole batch, or none."""
     fields = [f.name for f in dataclasses.fields(mjw.Model) if _is_per_simulation(f.type)]
     for name in changes:
         if name not in fields:
             what = "model field that can change on engine 'warp'"
             raise ValueError(unknown_name(what, name, fields))
+    sums = _SUMS & set(changes)
+    if sums and (model.actuator_damping.any() or model.actuator_dampingpoly.any()):
+        raise ValueError(
+            f"changes[{min(sums)!r}] would do another thing on engine 'warp', where MJX-Warp has "
+            "made a sum of it and of the damping of actuators (actuator_damping): take that out "
+            "of the model, or use engine 'c' or 'jax'."
+        )
     return changes
 
 

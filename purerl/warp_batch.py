@@ -34,7 +34,7 @@ class Batch:
     """MJX-Warp's model and data of a batch on one device, and the graphs of its calls."""
 
     def __init__(
-        self, model: mujoco.MjModel, size: int, contacts: int, rows: int, own: tuple[str, ...]
+        self, model: mujoco.MjModel, size: int, contacts: int, rows: int, changed: tuple[str, ...]
     ):
         """Takes the memory, on Warp's current device.
 
@@ -43,11 +43,21 @@ class Batch:
           size: simulations.
           contacts: room for them, shared by all simulations.
           rows: room for rows of constraints, of each simulation.
-          own: fields of the model of which each simulation has its own value.
+          changed: fields of the model of which each simulation has its own value.
+
+        Raises:
+          RuntimeError: there is not so much memory.
         """
-        self.model = put_model(model, dict.fromkeys(own, size))
-        self.data = mjw.make_data(model, nworld=size, naconmax=contacts, njmax=rows)
-        self.own = own
+        try:
+            self.model = put_model(model, dict.fromkeys(changed, size))
+            self.data = mjw.make_data(model, nworld=size, naconmax=contacts, njmax=rows)
+        except RuntimeError as error:
+            raise RuntimeError(
+                f"MJX-Warp has no memory for {size} simulations beside what JAX takes of a GPU, "
+                "three quarters unless XLA_PYTHON_CLIENT_MEM_FRACTION says less: set that to 0.5, "
+                f"or take fewer environments. ({error})"
+            ) from error
+        self.changed = changed
         self.graphs: dict[str, list[Callable[[], None]]] = {}
 
     def call(
@@ -61,6 +71,7 @@ class Batch:
         for field in takes:
             array = next(left)
             wp.copy(self._numbers(field, array), array)
+        self._clear()
         if name not in self.graphs:
             self.graphs[name] = [self._record(stage) for stage in stages]
         for stage, graph in zip(stages, self.graphs[name], strict=True):
@@ -68,6 +79,16 @@ class Batch:
             for field in filled(stage.gives):
                 array = next(left)
                 wp.copy(array, self._numbers(field, array))
+
+    def _clear(self) -> None:
+        """Clears what kernels would read of an earlier call; all else they write first.
+
+        A dense Newton step multiplies by 0 the rows of the Jacobian that are not in use, which
+        leaves a NaN there what it is.
+        """
+        self.data.overflow.zero_()
+        if not self.model.is_sparse:
+            self.data.efc.J.zero_()
 
     def _record(self, stage: Stage) -> Callable[[], None]:
         """Returns a function that runs a stage: on a GPU one CUDA graph."""
@@ -79,7 +100,7 @@ class Batch:
 
     def _numbers(self, field: str, like: wp.array) -> wp.array:
         """Returns a view of a field's numbers, [n] as `like`, whatever vectors they belong to."""
-        array = getattr(self.model if field in self.own else self.data, field)
+        array = getattr(self.model if field in self.changed else self.data, field)
         if array.capacity != like.capacity:
             raise ValueError(
                 f"MJX-Warp keeps {field!r} in {array.capacity} bytes and not in {like.capacity}: "
@@ -101,7 +122,11 @@ def filled(shapes: Shapes) -> Shapes:
 
 
 def make_call(
-    name: str, stages: tuple[Stage, ...], takes: Shapes, size: int, find: Callable[[Any], Batch]
+    name: str,
+    stages: tuple[Stage, ...],
+    takes: Shapes,
+    size: int,
+    get_batch: Callable[[Any], Batch],
 ) -> Callable[[dict[str, Array]], list[dict[str, Array]]]:
     """Returns a function for JAX that runs stages on a batch.
 
@@ -110,10 +135,10 @@ def make_call(
     Args:
       name: of the call; a batch records the graphs of a name once.
       stages: what is run, and what is read in between.
-      takes: the fields it is given: of the data, or of the model where they are a batch's own.
+      takes: the fields it is given: of the data, or of the model if they are a batch's `changed`.
       size: simulations.
-      find: returns the batch on one of Warp's devices, the current one. Warp keeps it, and what
-        it holds, as long as the process lasts.
+      get_batch: returns the batch on one of Warp's devices, the current one. Warp keeps it, and
+        what it holds, as long as the process lasts.
     """
     inputs = list(filled(takes))
     lengths = {
@@ -122,15 +147,18 @@ def make_call(
         for field, shape in filled(stage.gives).items()
     }
 
+    def empty(shape: tuple[int, ...]) -> Array:
+        return jnp.zeros((size, *shape), jnp.float32)
+
     if not lengths:  # Warp refuses a call that gives nothing
-        return lambda _: [{f: jnp.zeros((size, *s)) for f, s in t.gives.items()} for t in stages]
+        return lambda _: [{f: empty(s) for f, s in stage.gives.items()} for stage in stages]
 
     def run(*arrays: wp.array) -> None:
-        find(wp.get_device()).call(name, stages, inputs, arrays)
+        get_batch(wp.get_device()).call(name, stages, inputs, arrays)
 
-    kinds = {f"in_{field}": wp.float32 for field in inputs}
-    kinds |= {f"{f}_{i}": wp.int32 if f == "overflow" else wp.float32 for i, f in lengths}
-    _declare(run, kinds)
+    dtypes = {f"in_{field}": wp.float32 for field in inputs}
+    dtypes |= {f"{f}_{i}": wp.int32 if f == "overflow" else wp.float32 for i, f in lengths}
+    _declare(run, dtypes)
     call = wp.jax_callable(
         run,
         num_outputs=len(lengths),
@@ -139,20 +167,24 @@ def make_call(
     )
 
     def of_fields(given: dict[str, Array]) -> list[dict[str, Array]]:
+        call.call_id = 0  # or programs are not found in JAX's cache: it counts traces
         numbers = call(*(given[field].reshape(-1) for field in inputs))
         found = dict(zip(lengths, numbers, strict=True))
         return [
-            {f: found.get((i, f), jnp.zeros(0)).reshape(size, *s) for f, s in stage.gives.items()}
+            {
+                f: found[i, f].reshape(size, *s) if (i, f) in found else empty(s)
+                for f, s in stage.gives.items()
+            }
             for i, stage in enumerate(stages)
         ]
 
     return of_fields
 
 
-def _declare(function: Any, kinds: dict[str, Any]) -> None:
+def _declare(function: Any, dtypes: dict[str, Any]) -> None:
     """Gives a function of any number of arrays [n] the names and types that Warp asks it for."""
-    types = {name: wp.array(dtype=kind, ndim=1) for name, kind in kinds.items()}
+    types = {name: wp.array(dtype=dtype, ndim=1) for name, dtype in dtypes.items()}
     named = inspect.Parameter.POSITIONAL_OR_KEYWORD
-    parameters = [inspect.Parameter(name, named, annotation=kind) for name, kind in types.items()]
+    parameters = [inspect.Parameter(name, named, annotation=one) for name, one in types.items()]
     function.__signature__ = inspect.Signature(parameters)
     function.__annotations__ = types

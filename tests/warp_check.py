@@ -1,5 +1,7 @@
 """The `warp` engine, on a CPU: MJX-Warp runs the same kernels there, slowly and exactly."""
 
+import copy
+import dataclasses
 import functools
 import importlib.util
 
@@ -51,12 +53,12 @@ def test_it_agrees_with_mujoco_on_every_reading():
 
 def test_readings_of_bodies_are_those_of_a_whole_forward_pass():
     p, (state, ctrl) = Physics(biped(), engine_warp._OF_BODIES, 3, "warp"), running()
-    assert p._engine.now is engine_warp._bodies
+    assert p._engine.make_current is engine_warp._bodies
     found, expected = jax.jit(jax.vmap(p.step))(state, ctrl), compiled("warp")[1](state, ctrl)
     same(found[0], expected[0])
     same(found[1], [getattr(expected[1], name) for name in engine_warp._OF_BODIES])
     for others in (("cvel",), ("sensordata",), ("xpos", "ten_length")):
-        assert Physics(biped(), others, 3, "warp")._engine.now is engine_warp._forward
+        assert Physics(biped(), others, 3, "warp")._engine.make_current is engine_warp._forward
 
 
 def test_an_ant_meets_the_platforms_of_its_own_corridor_as_in_mujoco():
@@ -100,20 +102,74 @@ def test_a_blow_up_is_nan_and_touches_no_other():
     ):
         same(*(jax.tree.map(lambda x: x[keep], both) for both in (bad, good)))
         assert np.isnan(bad[0].qvel[2]).any()
+    assert all(np.isnan(x[2]).all() for x in jax.tree.leaves(bad))  # and so are its readings
 
 
-def test_a_call_leaves_nothing_to_the_next(monkeypatch):
-    """MJX-Warp's data outlives a call: numbers that are NaN, contacts, what found no room."""
-    step, (state, ctrl) = compiled("warp")[1], running()
-    first = step(state, ctrl)
-    step(jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), state), ctrl)
-    same(step(state, ctrl), first)
+# What no kernel writes: it is given, or constant.
+CONSTANT = {"qfrc_applied", "xfrc_applied", "eq_active", "geom_xpos", "geom_xmat"}
+CONSTANT |= {"xpos", "xquat", "xipos", "xmat", "ximat"}  # the world's
+
+
+def poison(data):
+    """Makes all numbers NaN that MJX-Warp keeps from one call to the next."""
+    for field in dataclasses.fields(data):
+        value = getattr(data, field.name)
+        if dataclasses.is_dataclass(value):
+            poison(value)
+        elif isinstance(value, warp.array) and value.size and field.name not in CONSTANT:
+            numbers = value.numpy()
+            value.assign(np.full_like(numbers, np.nan) if numbers.dtype == np.float32 else numbers)
+
+
+@pytest.mark.parametrize("jacobian", ["DENSE", "SPARSE"])
+def test_a_call_leaves_nothing_to_the_next(jacobian):
+    model = copy.copy(biped())
+    model.opt.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{jacobian}")
+    p, (_, state, ctrl) = Physics(model, READINGS, 2, "warp"), crouching("c")
+    init, step = jax.jit(jax.vmap(p.init)), jax.jit(jax.vmap(p.step))
+    first = init(state.qpos, state.qvel), step(state, ctrl)
+    assert jnp.isfinite(first[1][0].qpos).all()
+    (batch,) = p._engine.batches.values()
+    assert batch.model.is_sparse == (jacobian == "SPARSE")
+    poison(batch.data)
+    same(step(state, ctrl), first[1])
+    poison(batch.data)
+    same(init(state.qpos, state.qvel), first[0])
+    step(state.replace(qpos=state.qpos.at[:, 2].set(-jnp.inf)), ctrl)
+    same(step(state, ctrl), first[1])
+
+
+def test_what_found_no_room_is_not_told_again(monkeypatch):
     monkeypatch.setattr(engine_warp, "MOST_ROWS", 3)
     step, state, ctrl = crouching("warp", overflow_reading("warp"))
     assert step(state, ctrl)[1].overflow.sum() == 3
-    assert not step(jax.tree.map(lambda x: jnp.stack([x[3]] * NUMBER), state), ctrl)[
-        1
-    ].overflow.any()
+    high = jax.tree.map(lambda x: jnp.stack([x[3]] * NUMBER), state)
+    assert not step(high, ctrl)[1].overflow.any()
+
+
+def test_without_memory_it_says_how_to_get_some(monkeypatch):
+    def refuse(*args, **kwargs):
+        raise RuntimeError("Failed to allocate")
+
+    monkeypatch.setattr(warp_batch.mjw, "make_data", refuse)
+    with pytest.raises(RuntimeError, match="64 simulations .* XLA_PYTHON_CLIENT_MEM_FRACTION"):
+        warp_batch.Batch(biped(), 64, 8, 64, ())
+
+
+def test_a_sum_with_the_damping_of_actuators_is_not_changed():
+    model = copy.copy(biped())
+    p, (state, ctrl) = Physics(model, (), 2, "warp"), running()
+    one = jax.tree.map(lambda x: x[0], state)
+    p.step(one, ctrl[0], {"dof_damping": jnp.float32(model.dof_damping)})
+    model.actuator_damping[0] = 1.0
+    with pytest.raises(ValueError, match="'dof_damping'.* use engine 'c'"):
+        Physics(model, (), 2, "warp").step(one, ctrl[0], {"dof_damping": model.dof_damping})
+
+
+def test_a_program_has_the_same_text_whenever_it_is_traced():
+    p, (state, ctrl) = Physics(biped(), READINGS, 2, "warp"), running()
+    texts = [jax.jit(jax.vmap(p.step)).lower(state, ctrl).as_text() for _ in range(2)]
+    assert texts[0] == texts[1] and "call_id = 0" in texts[0]
 
 
 def test_a_field_of_another_size_than_expected_is_refused():
