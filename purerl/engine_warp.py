@@ -29,16 +29,11 @@ from mujoco.mjx.third_party import mujoco_warp as mjw  # noqa: E402
 from purerl.engine_jax import mjx_defaults, reading_shapes  # noqa: E402
 from purerl.model import unknown_name  # noqa: E402
 from purerl.types import Array, PyTree  # noqa: E402
-from purerl.warp_batch import Batch, Shapes, Stage, make_call, put_model  # noqa: E402
+from purerl.warp_batch import Batch, Shapes, Stage, make_call, put_model, room  # noqa: E402
 
-# Room in the buffers: what the model can need at most, but no more than this for a simulation.
-MOST_CONTACTS = 128  # simulations share it: one may have all contacts that the model allows
-MOST_ROWS = 512  # of constraints; each simulation has its own
 # Running out of iterations is the solver's setting; everything else drops something.
 _DROPPED = ~int(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS)
 
-_GEOM = mujoco.mjtGeom
-_ONE_POINT = (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_ELLIPSOID)
 _S = mujoco.mjtSensor
 _OF_CONSTRAINTS = (_S.mjSENS_JOINTLIMITPOS, _S.mjSENS_JOINTLIMITVEL, _S.mjSENS_TENDONLIMITPOS)
 _OF_CONSTRAINTS += (_S.mjSENS_TENDONLIMITVEL, _S.mjSENS_GEOMDIST, _S.mjSENS_GEOMNORMAL)
@@ -141,9 +136,7 @@ class WarpEngine:
         """Returns the batch on a device, of a size and with such changes."""
         key = device.alias, size, changed
         if key not in self.batches:
-            # One simulation may need all that the model allows; many have 128 each to share.
-            number = min(size * self.contacts, max(self.contacts, size * MOST_CONTACTS))
-            self.batches[key] = Batch(self.model, size, number, self.rows, changed)
+            self.batches[key] = Batch(self.model, size, self.contacts, self.rows, changed)
         return self.batches[key]
 
     def _steps(self, model: mjw.Model, data: mjw.Data) -> None:
@@ -166,31 +159,6 @@ class WarpEngine:
         """Returns the record of readings."""
         found = found | {"overflow": dropped}
         return self.record(*(found[name] for name in self.record._fields))
-
-
-def room(model: mujoco.MjModel, put: mjw.Model) -> tuple[int, int]:
-    """Returns how many contacts and rows of constraints one simulation gets room for.
-
-    The first is all that the model allows (pairs of geoms that can touch, times the points of
-    each), the second what all of them, all equalities, limits and frictions need, or `MOST_ROWS`.
-    """
-    if model.nflex or model.nhfield or (model.geom_type == _GEOM.mjGEOM_SDF).any():
-        return MOST_CONTACTS, MOST_ROWS  # as many points as there are cells: no useful bound
-    pairs = put.nxn_geom_pair_filtered.numpy().reshape(-1, 2)
-    contacts = int(_points(model.geom_type[pairs]).sum())
-    pyramidal = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
-    each = put.nmaxpyramid if pyramidal else put.nmaxcondim
-    # A weld has 6 rows. MJX-Warp drops an equality that would end where the buffer ends: 8 more.
-    others = 6 * model.neq + model.nv + 2 * model.ntendon + model.njnt + 8
-    rows = contacts * max(1, int(each)) + others
-    return contacts, min(rows, MOST_ROWS)
-
-
-def _points(types: np.ndarray) -> np.ndarray:
-    """Returns how many points pairs of geoms, types [n, 2], can touch in at most, [n]."""
-    one = np.isin(types, [int(g) for g in _ONE_POINT]).any(axis=1)
-    two = (types == _GEOM.mjGEOM_CAPSULE).any(axis=1)
-    return np.where(one, 1, np.where(two, 2, 8))
 
 
 def _on_host(model: mujoco.MjModel) -> mjw.Model:

@@ -15,12 +15,21 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 import warp as wp
 from mujoco.mjx.third_party import mujoco_warp as mjw
 
 from purerl.types import Array
 
 Shapes = dict[str, tuple[int, ...]]  # of fields, for one simulation
+
+
+# Room in the buffers: what the model can need at most, but no more than this for a simulation.
+MOST_CONTACTS = 128  # simulations share it: one may have all contacts that the model allows
+MOST_ROWS = 512  # of constraints; each simulation has its own
+
+_GEOM = mujoco.mjtGeom
+_ONE_POINT = (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_ELLIPSOID)
 
 
 class Stage(NamedTuple):
@@ -41,7 +50,7 @@ class Batch:
         Args:
           model: the model.
           size: simulations.
-          contacts: room for them, shared by all simulations.
+          contacts: as many as the model allows one simulation. All share what room there is.
           rows: room for rows of constraints, of each simulation.
           changed: fields of the model of which each simulation has its own value.
 
@@ -50,7 +59,9 @@ class Batch:
         """
         try:
             self.model = put_model(model, dict.fromkeys(changed, size))
-            self.data = mjw.make_data(model, nworld=size, naconmax=contacts, njmax=rows)
+            # One simulation may need all that the model allows; many have 128 each to share.
+            number = min(size * contacts, max(contacts, size * MOST_CONTACTS))
+            self.data = mjw.make_data(model, nworld=size, naconmax=number, njmax=rows)
         except RuntimeError as error:
             raise RuntimeError(
                 f"MJX-Warp has no memory for {size} simulations beside what JAX takes of a GPU, "
@@ -114,6 +125,31 @@ def put_model(model: mujoco.MjModel, sizes: dict[str, int]) -> mjw.Model:
     put = mjw.put_model(model, batch_sizes=sizes)
     put.opt.warn_overflow = 0  # or it prints
     return put
+
+
+def room(model: mujoco.MjModel, put: mjw.Model) -> tuple[int, int]:
+    """Returns how many contacts and rows of constraints one simulation gets room for.
+
+    The first is all that the model allows (pairs of geoms that can touch, times the points of
+    each), the second what all of them, all equalities, limits and frictions need, or `MOST_ROWS`.
+    """
+    if model.nflex or model.nhfield or (model.geom_type == _GEOM.mjGEOM_SDF).any():
+        return MOST_CONTACTS, MOST_ROWS  # as many points as there are cells: no useful bound
+    pairs = put.nxn_geom_pair_filtered.numpy().reshape(-1, 2)
+    contacts = int(_points(model.geom_type[pairs]).sum())
+    pyramidal = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    each = put.nmaxpyramid if pyramidal else put.nmaxcondim
+    # A weld has 6 rows. MJX-Warp drops an equality that would end where the buffer ends: 8 more.
+    others = 6 * model.neq + model.nv + 2 * model.ntendon + model.njnt + 8
+    rows = contacts * max(1, int(each)) + others
+    return contacts, min(rows, MOST_ROWS)
+
+
+def _points(types: np.ndarray) -> np.ndarray:
+    """Returns how many points pairs of geoms, types [n, 2], can touch in at most, [n]."""
+    one = np.isin(types, [int(g) for g in _ONE_POINT]).any(axis=1)
+    two = (types == _GEOM.mjGEOM_CAPSULE).any(axis=1)
+    return np.where(one, 1, np.where(two, 2, 8))
 
 
 def filled(shapes: Shapes) -> Shapes:

@@ -140,7 +140,7 @@ def test_a_call_leaves_nothing_to_the_next(jacobian):
 
 
 def test_what_found_no_room_is_not_told_again(monkeypatch):
-    monkeypatch.setattr(engine_warp, "MOST_ROWS", 3)
+    monkeypatch.setattr(warp_batch, "MOST_ROWS", 3)
     step, state, ctrl = crouching("warp", overflow_reading("warp"))
     assert step(state, ctrl)[1].overflow.sum() == 3
     high = jax.tree.map(lambda x: jnp.stack([x[3]] * NUMBER), state)
@@ -198,10 +198,10 @@ def test_contacts_agree_with_mujoco():
 def test_what_finds_no_room_is_told(monkeypatch, limit, lost):
     """Rows of constraints are each simulation's own; all share the room for contacts."""
     if limit == "MOST_ROWS":
-        monkeypatch.setattr(engine_warp, "MOST_ROWS", 3)
+        monkeypatch.setattr(warp_batch, "MOST_ROWS", 3)
     else:
         monkeypatch.setattr(engine_warp, "room", lambda *_: (1, 64))
-        monkeypatch.setattr(engine_warp, "MOST_CONTACTS", 1)
+        monkeypatch.setattr(warp_batch, "MOST_CONTACTS", 1)
     step, state, ctrl = crouching("warp", overflow_reading("warp"))
     after, readings = step(state, ctrl)
     np.testing.assert_array_equal(overflow_metric(readings)["overflow_count"], lost)
