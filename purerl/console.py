@@ -15,6 +15,8 @@ from purerl.train import Plan
 from purerl.types import PyTree
 
 SECONDS_BETWEEN_LINES = 2.0
+# Or one would think that it hangs.
+SLOW_BEGINNINGS = {"warp": "; its kernels, once on a machine, take a minute or more of an update"}
 
 
 def describe_plan(
@@ -34,7 +36,7 @@ def describe_plan(
         f"metrics      a line every {plan.log_every} updates",
         f"parameters   {count(abstract.params):,}",
         f"state        {size(abstract) / 1e6:,.1f} MB",
-        f"engine       {setup.engine}",
+        f"engine       {setup.engine}{SLOW_BEGINNINGS.get(setup.engine, '')}",
         *_shards(setup, facts),
         f"device       {facts['devices']} x {device['kind']} ({device['platform']})",
         f"cache        {cache}",
