@@ -51,7 +51,7 @@ class WarpEngine:
     """Steps a model with MJX-Warp; see `physics.Physics` for what `init` and `step` promise."""
 
     def __init__(self, model: mujoco.MjModel, record: Any, late: tuple[str, ...], substeps: int):
-        """Puts the model on the device.
+        """Prepares the model; memory on a device is taken when a batch is first stepped there.
 
         Args:
           model: the model.
@@ -61,7 +61,7 @@ class WarpEngine:
         """
         self.record, self.late, self.substeps = record, late, substeps
         names = tuple(name for name in record._fields if name != "overflow")
-        if "subtree_com" in names:  # `_read` needs both
+        if "subtree_com" in names:  # `_combine` needs both
             names += ("xipos",)
         self.shapes = reading_shapes(model, names)
         self.late_sensors = _late_sensors(model)
