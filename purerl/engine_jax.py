@@ -41,8 +41,8 @@ class JaxEngine:
         self.record, self.late, self.substeps = record, late, substeps
         self.shapes = reading_shapes(model, record._fields)
         with mjx_defaults():
-            self.model = put_model(model, "jax")
-            self.data = make_data(model, "jax")
+            self.model = put_model(model)
+            self.data = mjx.make_data(model, device=_own_device(), impl="jax")
         self._traces: dict[Any, core.ClosedJaxpr] = {}
         self._functions: dict[Any, Callable] = {}
 
@@ -126,19 +126,14 @@ def check_known(model: mujoco.MjModel) -> None:
             )
 
 
-def put_model(model: mujoco.MjModel, implementation: str) -> mjx.Model:
+def put_model(model: mujoco.MjModel) -> mjx.Model:
     """Puts a model on the device; ValueError if MJX cannot simulate it."""
     try:
-        return mjx.put_model(model, device=_own_device(), impl=implementation)
+        return mjx.put_model(model, device=_own_device(), impl="jax")
     except NotImplementedError as error:
         raise ValueError(
             f"MJX cannot simulate this model: {error} Change the model, or use engine 'c'."
         ) from error
-
-
-def make_data(model: mujoco.MjModel, implementation: str, **room: int) -> mjx.Data:
-    """Returns a model's data at its default state, with so much room for contacts (Warp alone)."""
-    return mjx.make_data(model, device=_own_device(), impl=implementation, **room)
 
 
 def _own_device() -> jax.Device:

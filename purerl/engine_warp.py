@@ -114,23 +114,23 @@ class WarpEngine:
         if (name, size, changed) not in self.calls:
             takes = {field: value.shape[1:] for field, value in given.items()}
             self.calls[name, size, changed] = make_call(
-                name, self._stages(name), takes, size, lambda on: self._batch(on, size, changed)
+                name,
+                self._stages(name, takes),
+                takes,
+                size,
+                lambda on: self._batch(on, size, changed),
             )
         return self.calls[name, size, changed](given)
 
-    def _stages(self, name: str) -> tuple[Stage, Stage]:
+    def _stages(self, name: str, takes: Shapes) -> tuple[Stage, Stage]:
         """Returns what "init" and "step" run: the physics, then what makes readings current."""
         late = {n: self.shapes[n] for n in self.late}
         if name == "init":
             first = Stage(mjw.forward if late else _nothing, late)
         else:
-            first = Stage(self._steps, late | self._state_shapes() | {"overflow": ()})
+            integrated = {n: takes[n] for n in _INTEGRATED}
+            first = Stage(self._steps, late | integrated | {"overflow": ()})
         return first, Stage(self.make_current, {n: self.shapes[n] for n in self.early})
-
-    def _state_shapes(self) -> Shapes:
-        """Returns the shapes of what a step integrates."""
-        nq, nv, na = self.model.nq, self.model.nv, self.model.na
-        return dict(zip(_INTEGRATED, ((nq,), (nv,), (na,), (), (nv,)), strict=True))
 
     def _batch(self, device: Any, size: int, changed: tuple[str, ...]) -> Batch:
         """Returns the batch on a device, of a size and with such changes."""

@@ -23,7 +23,6 @@ from purerl.types import Array
 
 Shapes = dict[str, tuple[int, ...]]  # of fields, for one simulation
 
-
 # Room in the buffers: what the model can need at most, but no more than this for a simulation.
 MOST_CONTACTS = 128  # simulations share it: one may have all contacts that the model allows
 MOST_ROWS = 512  # of constraints; each simulation has its own
@@ -70,6 +69,7 @@ class Batch:
             ) from error
         self.changed = changed
         self.graphs: dict[str, list[Callable[[], None]]] = {}
+        self.views: dict[str, wp.array] = {}  # of fields that calls take or give
 
     def call(
         self, name: str, stages: tuple[Stage, ...], takes: Iterable[str], arrays: Iterable[wp.array]
@@ -111,13 +111,17 @@ class Batch:
 
     def _numbers(self, field: str, like: wp.array) -> wp.array:
         """Returns a view of a field's numbers, [n] as `like`, whatever vectors they belong to."""
+        if field in self.views:
+            return self.views[field]
         array = getattr(self.model if field in self.changed else self.data, field)
         if array.capacity != like.capacity:
             raise ValueError(
                 f"MJX-Warp keeps {field!r} in {array.capacity} bytes and not in {like.capacity}: "
                 "this version of it is not one that purerl knows."
             )
-        return wp.array(ptr=array.ptr, dtype=like.dtype, shape=like.shape, device=array.device)
+        view = wp.array(ptr=array.ptr, dtype=like.dtype, shape=like.shape, device=array.device)
+        self.views[field] = view
+        return view
 
 
 def put_model(model: mujoco.MjModel, sizes: dict[str, int]) -> mjw.Model:
