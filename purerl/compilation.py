@@ -1,11 +1,9 @@
 """A run's programs: its beginning, an update, the evaluation.
 
 They are compiled at the same time, since XLA does not hold Python's lock; where cores are few, the
-evaluation when it is first needed. With the `c` engine an update is two programs, because JAX's
-cache refuses one with a call to the host: so the half that learns is compiled once, not at every
-start. On a GPU it is two as well, which compile side by side. With MJX on a CPU it is one: acting
-alone, 256 ants on two cores, never ended (all of XLA's threads waiting, jax 0.10.2), where the
-whole update does.
+evaluation when it is first needed. An update is two programs, which compile side by side, with the
+`c` engine and on a GPU. With MJX on a CPU it is one: acting alone, 256 ants on two cores, never
+ended (all of XLA's threads waiting, jax 0.10.2), where the whole update does.
 """
 
 import contextlib
@@ -31,8 +29,8 @@ from purerl.types import Array, Metrics, Network, PyTree, TrainState
 # 16 came to brax's ant's first evaluation on a GPU in 22 s with all side by side, in 39 s else (21
 # November 2026, when its program was smaller).
 FEW_CORES = 7
-# LLVM's level on a CPU, 3 elsewhere: what runs once, or is compiled at every start, shall be ready
-# soon. For an ant, `c`, `init` takes 1.5 s of a core instead of 3.3; `collect` 3.9 instead of 4.7
+# LLVM's level on a CPU, 3 elsewhere: what runs once, or waits for MuJoCo, shall be ready soon. For
+# an ant, `c`, `init` takes 1.5 s of a core instead of 3.3; `collect` 3.9 instead of 4.7
 # and is as fast (at level 0 it takes 2.4, and is slower by 8%).
 LEVELS = {"init": 0, "collect": 1}
 

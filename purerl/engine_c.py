@@ -1,15 +1,17 @@
 """The `c` engine: MuJoCo's own C code on a thread pool, as a pure function inside jit.
 
-This is the one host callback of the library. `mujoco.batch.Batch` loads a state row, steps and
-saves the row, and its results do not depend on the number of threads: the callback is a pure
-function of its arguments, which is what `jax.pure_callback` asks for.
+This is the one call to the host of the library. `mujoco.batch.Batch` loads a state row, steps and
+saves the row, and its results do not depend on the number of threads: it is a pure function of its
+arguments, which is what `jax.pure_callback` and `host_calls` ask for.
 """
 
 import copy
 import functools
+import hashlib
 import math
 import os
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -18,6 +20,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
+from purerl import host_calls
 from purerl.types import Array, PyTree
 
 _BLOWN_UP = [
@@ -43,7 +46,10 @@ class CEngine:
           stage: `mujoco.mjtStage` to compute at the new state, the least that the readings need.
           substeps: physics steps in one control step.
         """
-        self.model, self.record, self.stage, self.substeps = model, record, stage, substeps
+        # A copy, since programs know the engine by its name.
+        self.model, self.record = copy.copy(model), record
+        self.stage, self.substeps = stage, substeps
+        self.name = _name(self.model, (*record._fields, stage))
         data = mujoco.MjData(model)
         self.shapes = [np.shape(getattr(data, name)) for name in record._fields]
         self.batches: dict[tuple[int, tuple[str, ...]], Batch] = {}
@@ -66,11 +72,10 @@ class CEngine:
         row = _pack([*leaves, ctrl, *(changes[n] for n in names)])
         sizes = [leaf.shape for leaf in leaves] + self.shapes
         width = sum(math.prod(s) for s in sizes)
-        host = functools.partial(
-            _run_rows, self, tuple(state.__dataclass_fields__), names, substeps
-        )
-        shape = jax.ShapeDtypeStruct((width,), jnp.float32)
-        out = _unpack(jax.pure_callback(host, shape, row, vmap_method="broadcast_all"), sizes)
+        fields = tuple(state.__dataclass_fields__)
+        host = functools.partial(_run_rows, self, fields, names, substeps)
+        name = "-".join([self.name, str(substeps), *fields, *names])
+        out = _unpack(_call_host(name, host, width, row), sizes)
         state = jax.tree.unflatten(structure, out[: len(leaves)])
         return state, self.record(*map(_as_matrix, self.record._fields, out[len(leaves) :]))
 
@@ -89,6 +94,25 @@ def usable_cores() -> int:
     0.74 of the rate of two.
     """
     return len(os.sched_getaffinity(0))
+
+
+def _name(model: mujoco.MjModel, rest: tuple) -> str:
+    """Returns a name of all that an engine's results depend on: the model, and the `rest`."""
+    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    return "purerl-" + hashlib.sha256(content.tobytes() + repr(rest).encode()).hexdigest()
+
+
+def _call_host(name: str, host: Callable, width: int, row: Array) -> Array:
+    """Calls `host` from a program; returns [width].
+
+    On a GPU machine by JAX's own callback, which it does not keep in its cache.
+    """
+    if jax.default_backend() == "cpu":
+        host_calls.register(name, host)
+        return host_calls.call(name, width, row)
+    shape = jax.ShapeDtypeStruct((width,), jnp.float32)
+    return jax.pure_callback(host, shape, row, vmap_method="broadcast_all")
 
 
 def _movable(model: mujoco.MjModel, names: tuple[str, ...]) -> mujoco.MjModel:

@@ -39,11 +39,11 @@ EFFECTS = {
 }
 PURE = sorted(set(FILES) - EFFECTS - {"__init__"})
 # The one host call above the line: MuJoCo's C code, a pure function of its arguments, on as many
-# threads as this process has cores.
-HOST_CALL = {"engine_c"}
+# threads as this process has cores; and how programs reach it.
+HOST_CALL = {"engine_c", "host_calls"}
 FORBIDDEN_CALLS = {"print", "open", "input", "exec", "eval", "__import__"}
 FORBIDDEN_MODULES = {"time", "datetime", "os", "sys", "random", "subprocess", "logging", "pathlib"}
-CALLBACKS = {"pure_callback", "io_callback", "callback", "debug_callback"}
+CALLBACKS = {"pure_callback", "io_callback", "callback", "debug_callback", "ffi_call"}
 
 
 def imports(path):
