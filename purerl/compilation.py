@@ -13,6 +13,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -48,6 +49,30 @@ class Programs(NamedTuple):
     unordered: list[str]  # sums of the update whose order nothing fixes on a GPU
     spread: Callable[[TrainState], Any] = lambda state: state  # onto the devices, for the others
     fetch: Callable[[Any], TrainState] = lambda state: state  # back onto one
+
+
+def set_up_jax(cache: bool) -> str:
+    """Sets what bits depend on, whatever a later JAX's defaults; returns the cache's folder.
+
+    Without `cache`, or with JAX_ENABLE_COMPILATION_CACHE=false in the environment, there is none.
+    """
+    jax.config.update("jax_threefry_partitionable", True)
+    jax.config.update("jax_default_prng_impl", "threefry2x32")
+    if not cache or not jax.config.values["jax_enable_compilation_cache"]:
+        jax.config.update("jax_enable_compilation_cache", False)
+        return "off"
+    # JAX has read JAX_COMPILATION_CACHE_DIR by now, if it is set.
+    folder = jax.config.values["jax_compilation_cache_dir"] or str(cache_folder())
+    jax.config.update("jax_compilation_cache_dir", folder)
+    return folder
+
+
+def cache_folder() -> Path:
+    """Returns the folder for compiled programs, where the user keeps caches (XDG_CACHE_HOME)."""
+    caches = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if not caches.is_absolute():  # the freedesktop.org specification takes no other
+        caches = Path.home() / ".cache"
+    return caches / "purerl" / "jax"
 
 
 @contextlib.contextmanager

@@ -53,6 +53,7 @@ def evaluate_run(options: Options) -> dict[str, Any]:
     import jax
     import numpy as np
 
+    from purerl.compilation import set_up_jax
     from purerl.evaluation import evaluate
     from purerl.keys import Purpose, derive
     from purerl.rundir import restore
@@ -61,6 +62,7 @@ def evaluate_run(options: Options) -> dict[str, Any]:
         raise UserError(f"episodes is {options.episodes}; it must be at least 1.")
     if options.json is not None and not options.json.absolute().parent.is_dir():
         raise UserError(f"{options.json} cannot be written: there is no such folder.")
+    set_up_jax(cache=True)
     run = restore(options.run, options.checkpoint, lambda line: print(line), options.engine)
     config, env, network, engine = run.setup
 

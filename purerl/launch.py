@@ -58,7 +58,7 @@ def execute(
     distributed.start(options.distributed)
     alone(lambda: rundir.check_new_or_resume(runs, options.resume))
     loggers = needed_loggers(options)
-    cache = set_up_jax(options.cache)
+    cache = compilation.set_up_jax(options.cache)
     with compilation.no_collection():
         setup = rundir.build(chosen)
         abstract = compilation.abstract_state(*setup[:3])
@@ -196,17 +196,3 @@ def begin_or_go_on(
     if found:
         checkpoint.check_fits(folder / "checkpoints", abstract)
         rundir.accept_changes(folder, source, settings, facts, found)
-
-
-def set_up_jax(cache: bool) -> str:
-    """Sets what bits depend on, whatever a later JAX's defaults; returns the cache's folder."""
-    jax.config.update("jax_threefry_partitionable", True)
-    jax.config.update("jax_default_prng_impl", "threefry2x32")
-    if not cache:
-        jax.config.update("jax_enable_compilation_cache", False)
-        return "off"
-    # JAX has read JAX_COMPILATION_CACHE_DIR by now, if it is set.
-    folder = jax.config.values["jax_compilation_cache_dir"]
-    folder = folder or str(Path.home() / ".cache" / "purerl" / "jax")
-    jax.config.update("jax_compilation_cache_dir", folder)
-    return folder

@@ -71,9 +71,11 @@ def render_run(options: Options) -> Path:
     # First of all: an experiment imports mujoco and dm_control, which look for OpenGL themselves.
     open_gl(width, height).free()
 
+    from purerl.compilation import set_up_jax
     from purerl.rundir import restore
     from purerl.video import episode_pictures, frame_stride, physics_of
 
+    set_up_jax(cache=True)
     run = restore(options.run, options.checkpoint, print, options.engine)
     env = run.setup.env
     stride = frame_stride(env.control_timestep)

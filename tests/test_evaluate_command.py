@@ -1,6 +1,7 @@
 """`python -m purerl.evaluate RUN` works from the run's folder alone."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from purerl import checkpoint, evaluate, run
 from purerl.errors import USAGE
 
 TOY = Path(__file__).parent / "toy_experiment.py"
+ROOT = TOY.parent.parent
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +42,27 @@ def test_it_reports_every_metric_under_the_runs_own_settings(trained, tmp_path, 
     assert found["metrics"]["episode_return"]["mean"] == pytest.approx(sum(values) / 6)
     said = capsys.readouterr().out
     assert "N = 6 episodes" in said and "reward_mean" in said and "std" in said
+
+
+def test_a_second_process_finds_its_program_compiled(trained, tmp_path):
+    """The event is JAX's own, of a program that it has loaded from its cache."""
+    watch = (
+        "import sys, jax; from purerl import evaluate; hits = [];"
+        "jax.monitoring.register_event_listener(lambda name, **_: hits.append(name));"
+        "evaluate.main(sys.argv[1:]);"
+        "print(hits.count('/jax/compilation_cache/cache_hits'))"
+    )
+    own = {"XDG_CACHE_HOME": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    command = [sys.executable, "-c", watch, str(trained), "--episodes", "3"]
+
+    def start() -> list[str]:
+        said = subprocess.check_output(command, text=True, env=os.environ | own, cwd=ROOT)
+        return said.splitlines()
+
+    first, second = start(), start()
+    assert (tmp_path / "purerl" / "jax").is_dir()
+    assert int(first[-1]) < int(second[-1])
+    assert first[:-1] == second[:-1]
 
 
 def test_equal_seeds_give_equal_episodes(trained, tmp_path):

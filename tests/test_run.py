@@ -16,7 +16,18 @@ from pathlib import Path
 import jax
 import pytest
 
-from purerl import checkpoint, console, errors, launch, recorder, run, rundir, snapshot, train
+from purerl import (
+    checkpoint,
+    compilation,
+    console,
+    errors,
+    launch,
+    recorder,
+    run,
+    rundir,
+    snapshot,
+    train,
+)
 from purerl.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
 from purerl.experiment import Evaluation, find, load
 from purerl.shards import Shards
@@ -557,3 +568,13 @@ def test_the_second_signal_ends_at_once(monkeypatch, capsys):
         os.kill(os.getpid(), signal.SIGINT)
     assert ended == [128 + signal.SIGINT]
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_compiled_programs_are_where_the_user_keeps_caches(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert compilation.cache_folder() == tmp_path / "purerl" / "jax"
+    for none in ("", "relative/path"):
+        monkeypatch.setenv("XDG_CACHE_HOME", none)
+        assert compilation.cache_folder() == Path.home() / ".cache" / "purerl" / "jax"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert compilation.cache_folder() == Path.home() / ".cache" / "purerl" / "jax"
