@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from purerl import rundir
+from purerl.compilation import set_up_jax
 from purerl.errors import UserError, leave
 from purerl.evaluation import evaluate
 from purerl.keys import Purpose, derive
@@ -84,6 +85,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--seed", type=int, default=12345, help="draws the corridors")
     parser.add_argument("--engine", default="", help="where it should not be the run's own")
     options = parser.parse_args(arguments)
+    set_up_jax(cache=True)
     trained = rundir.restore(options.run, "latest", print, options.engine)
     setup, state = trained.setup, trained.saved.state
     if "gaps_crossed_count" not in jax.eval_shape(setup.env.reset, jax.random.key(0)).metrics:

@@ -110,9 +110,10 @@ def figures(record: Record, seconds_left: float, steps_per_second: float) -> str
     shown = "-" if value is None else f"{value:.2f}"
     minutes, seconds = divmod(round(seconds_left), 60)
     left = f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"
-    return (
-        f"steps {record['steps']:,}  return {shown}  {steps_per_second:,.0f} steps/s  left {left}"
-    )
+    lost = record.get("train/nonfinite_resets")
+    warning = f"  {lost:,.0f} episodes lost (NaN, or absurd)" if lost else ""
+    rate = f"{steps_per_second:,.0f} steps/s"
+    return f"steps {record['steps']:,}  return {shown}{warning}  {rate}  left {left}"
 
 
 class Bar:

@@ -7,7 +7,6 @@ arguments, which is what `jax.pure_callback` and `host_calls` ask for.
 
 import copy
 import functools
-import hashlib
 import math
 import os
 import threading
@@ -21,6 +20,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from purerl import host_calls
+from purerl.model import hash_model
 from purerl.types import Array, PyTree
 
 _BLOWN_UP = [
@@ -49,7 +49,8 @@ class CEngine:
         # A copy, since programs know the engine by its name.
         self.model, self.record = copy.copy(model), record
         self.stage, self.substeps = stage, substeps
-        self.name = _name(self.model, (*record._fields, stage))
+        # All that results depend on, but what is asked of a call.
+        self.name = f"purerl-{hash_model(self.model, (*record._fields, stage))}"
         data = mujoco.MjData(model)
         self.shapes = [np.shape(getattr(data, name)) for name in record._fields]
         self.batches: dict[tuple[int, tuple[str, ...]], Batch] = {}
@@ -94,13 +95,6 @@ def usable_cores() -> int:
     0.74 of the rate of two.
     """
     return len(os.sched_getaffinity(0))
-
-
-def _name(model: mujoco.MjModel, rest: tuple) -> str:
-    """Returns a name of all that an engine's results depend on: the model, and the `rest`."""
-    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, content)
-    return "purerl-" + hashlib.sha256(content.tobytes() + repr(rest).encode()).hexdigest()
 
 
 def _call_host(name: str, host: Callable, width: int, row: Array) -> Array:

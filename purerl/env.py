@@ -63,12 +63,8 @@ def check_env(env: Env, num_envs: int = 4, num_steps: int = 4) -> None:
     Raises:
       EnvError: names the field that broke a rule, and the rule.
     """
-    _check_members(env)
+    check_shapes(env)
     keys = jax.random.split(jax.random.key(0), num_envs)
-    fresh = jax.eval_shape(env.reset, jax.random.key(0))
-    _check_fields(fresh)
-    after = _step_shapes(env, fresh)
-    _check_same("reset and step", _specs(fresh), _specs(after))
     reset = jax.jit(jax.vmap(env.reset))
     state = reset(_again(keys))
     _check_bits("equal keys", state, reset(keys), "reset must be a function of its key alone")
@@ -84,7 +80,16 @@ def check_env(env: Env, num_envs: int = 4, num_steps: int = 4) -> None:
     _check_finite("a step after termination", rollout(ended, actions)[1])
 
 
-def _check_members(env: Env) -> None:
+def check_shapes(env: Env) -> None:
+    """Verifies what of the protocol shows without computing anything; EnvError as `check_env`."""
+    check_members(env)
+    fresh = jax.eval_shape(env.reset, jax.random.key(0))
+    _check_fields(fresh)
+    _check_same("reset and step", _specs(fresh), _specs(_step_shapes(env, fresh)))
+
+
+def check_members(env: Env) -> None:
+    """Verifies that an environment has what every one has, of the right kind."""
     for name in ("control_timestep", "action_size", "reset", "step"):
         if not hasattr(env, name):
             raise EnvError(

@@ -5,6 +5,7 @@ import difflib
 import os
 import signal
 import sys
+import traceback
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NoReturn
@@ -60,6 +61,17 @@ def one_line(error: BaseException) -> str:
     """Returns an exception as one line of text, with its class where the message alone is bare."""
     text = " ".join(str(error).split())
     return text if len(text) > 20 else f"{type(error).__name__}: {text}"
+
+
+def own_line(error: BaseException | None) -> str:
+    """Returns " (FILE, line N)", the last line of somebody's own code on the way to an error.
+
+    That is neither this library's nor an installed package's; "" if there is none.
+    """
+    frames = traceback.extract_tb(error.__traceback__ if error else None)
+    others = ("site-packages", "dist-packages", str(Path(__file__).parent))
+    own = [frame for frame in frames if not any(other in frame.filename for other in others)]
+    return f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""
 
 
 def tell(error: UserError | RunError | StoppedError) -> int:

@@ -9,7 +9,15 @@ from purerl.config import Config
 from purerl.distributions import sample
 from purerl.env import Env, State
 from purerl.keys import Purpose, derive, per_environment
-from purerl.rollout import act, episode_metric, is_lost, repeat_step, select, start_episodes
+from purerl.rollout import (
+    act,
+    episode_metric,
+    is_lost,
+    repeat_step,
+    select,
+    start_episodes,
+    start_memory,
+)
 from purerl.types import Array, EpisodeStats, Metrics, Network, PyTree, TrainState
 
 
@@ -49,19 +57,7 @@ def evaluate(
       "lost" [N], 1 for an episode that ended because its state was no longer finite.
     """
     reset_key, action_key = jax.random.split(key)
-    start = jax.vmap(env.reset)(per_environment(reset_key, num_episodes))
-    limit = jnp.full(num_episodes, config.episode_length, jnp.int32)
-    never = jnp.zeros(num_episodes, bool)
-    progress = Progress(
-        t=jnp.zeros((), jnp.int32),
-        env=start,
-        memory=jax.tree.map(
-            lambda x: jnp.zeros((num_episodes, *x.shape[1:]), x.dtype), state.carry
-        ),
-        episode=start_episodes(start, limit),
-        over=never,
-        lost=never,
-    )
+    progress = start(config, env, state, reset_key, num_episodes)
 
     def step(progress: Progress) -> Progress:
         keys = per_environment(jax.random.fold_in(action_key, progress.t), num_episodes)
@@ -75,6 +71,23 @@ def evaluate(
         "episode_length": episode.length.astype(jnp.float32),
         "lost": end.lost.astype(jnp.float32),
     }
+
+
+def start(
+    config: Config, env: Env, state: TrainState, reset_key: Array, num_episodes: int
+) -> Progress:
+    """Returns N episodes about to start."""
+    fresh = jax.vmap(env.reset)(per_environment(reset_key, num_episodes))
+    limit = jnp.full(num_episodes, config.episode_length, jnp.int32)
+    never = jnp.zeros(num_episodes, bool)
+    return Progress(
+        t=jnp.zeros((), jnp.int32),
+        env=fresh,
+        memory=start_memory(state.carry, num_episodes),
+        episode=start_episodes(fresh, limit),
+        over=never,
+        lost=never,
+    )
 
 
 def evaluate_in_run(
@@ -101,12 +114,22 @@ def _step(
         noise = jax.vmap(lambda key: jax.random.normal(key, (env.action_size,)))(keys)
         raw = sample(output.distribution, noise)
     action = config.action_distribution.to_action(raw)
-    env_state, episode, _ = repeat_step(config, env, progress.env, progress.episode, action)
+    return advance(config, env, progress, action, memory)[0]
+
+
+def advance(
+    config: Config, env: Env, progress: Progress, action: Array, memory: PyTree
+) -> tuple[Progress, Array]:
+    """Takes `action` [N, A] in every episode that is not over; returns the rewards [N] too.
+
+    `memory` is the policy's after it has chosen the action.
+    """
+    env_state, episode, reward = repeat_step(config, env, progress.env, progress.episode, action)
     lost = jax.vmap(is_lost)(env_state)
     # A lost step's reward and metrics are not numbers; its episode keeps those before it.
     episode = select(progress.over | lost, progress.episode, episode)
     ended = env_state.terminated | env_state.truncated | lost
-    return Progress(
+    after = Progress(
         t=progress.t + 1,
         env=select(progress.over | lost, progress.env, env_state),
         memory=select(progress.over, progress.memory, memory),
@@ -114,3 +137,4 @@ def _step(
         over=progress.over | ended,
         lost=progress.lost | (lost & ~progress.over),
     )
+    return after, reward

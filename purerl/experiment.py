@@ -121,28 +121,41 @@ def find(name: str) -> Source:
     raise unknown("experiment", name, named, f" in {' or '.join(map(str, folders())) or 'sight'}")
 
 
-def load(path: Path, name: str = "") -> Source:
-    """Loads the experiment that a Python file defines as `experiment = Experiment(...)`."""
+def load(path: Path, name: str = "", copy_of: Path | None = None) -> Source:
+    """Loads the experiment that a Python file defines as `experiment = Experiment(...)`.
+
+    Args:
+      path: the file.
+      name: the experiment's, if that is not the file's.
+      copy_of: the file that it is a copy of. Where that still exists it is its `__file__`: what
+        the experiment reads stands beside it.
+    """
     path = path.resolve()
+    module_name = f"purerl_experiment_{path.stem}"
     # A file of a package, imported under its own name, so that its source counts as the package's.
     if (path.parent / "__init__.py").exists() and str(path.parent.parent) in sys.path:
-        return _checked(_execute(f"{path.parent.name}.{path.stem}", path), name or path.stem, path)
-    return _checked(_execute(f"purerl_experiment_{path.stem}", path), name or path.stem, path)
+        module_name = f"{path.parent.name}.{path.stem}"
+    place = copy_of if copy_of is not None and copy_of.is_file() else path
+    return _checked(_execute(module_name, path, place), name or path.stem, path)
 
 
-def _execute(module_name: str, path: Path) -> ModuleType:
+def _execute(module_name: str, path: Path, place: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(module_name, path)
     assert spec is not None and spec.loader is not None  # it is an existing .py file
     module = importlib.util.module_from_spec(spec)
     sys.modules[module_name] = module  # dataclasses and help texts look their module up
-    with _mistakes(str(path)):
+    module.__file__ = str(place)
+    with _mistakes(str(path), place):
         spec.loader.exec_module(module)
     return module
 
 
 @contextlib.contextmanager
-def _mistakes(file: str) -> Iterator[None]:
-    """Turns an error in a person's own file into one line with the line that they need to see."""
+def _mistakes(file: str, place: Path) -> Iterator[None]:
+    """Turns an error in a person's own file into one line with the line that they need to see.
+
+    `place` is where the file's modules stand: a run has a copy of it alone.
+    """
     try:
         yield
     except SyntaxError as error:
@@ -151,12 +164,12 @@ def _mistakes(file: str) -> Iterator[None]:
         frames = traceback.extract_tb(error.__traceback__)
         lines = [frame.lineno for frame in frames if frame.filename == file]
         where = f", line {lines[-1]}" if lines else ""
-        raise UserError(f"{file}{where}: {one_line(error)}{_hint(file, error)}") from error
+        raise UserError(f"{file}{where}: {one_line(error)}{_hint(place, error)}") from error
 
 
-def _hint(file: str, error: Exception) -> str:
+def _hint(file: Path, error: Exception) -> str:
     """Returns what to do about a module that stands beside the file that imports it."""
-    beside = Path(file).parent
+    beside = file.parent
     if isinstance(error, ModuleNotFoundError) and error.name:
         place = beside / error.name.partition(".")[0]
         if place.is_dir() or place.with_suffix(".py").exists():
@@ -172,7 +185,7 @@ def _from_module(name: str) -> Source:
     if spec is None or spec.origin is None:
         raise unknown("experiment", name, available())
     path = Path(spec.origin)
-    with _mistakes(spec.origin):
+    with _mistakes(spec.origin, path):
         module = importlib.import_module(name)
         nodes = list(ast.walk(ast.parse(path.read_text())))
     if any(isinstance(node, ast.ImportFrom) and node.level for node in nodes):

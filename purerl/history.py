@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.errors import UserError, one_line, unknown
+from purerl.rundir import runs_in
 from purerl.train import MAX_SKIPPED_IN_A_ROW
 
 NOT_LEARNING = ("seed", "evaluation")  # settings that tell runs of one configuration apart
@@ -67,20 +68,12 @@ def find_runs(arguments: Iterable[Path]) -> list[Path]:
     found: list[Path] = []
     for argument in arguments:
         places = sorted(map(Path, glob.glob(str(argument)))) or [argument]
-        runs = [run for place in places for run in _runs_in(place)]
+        runs = [run for place in places for run in runs_in(place)]
         if not runs:
             kind = "holds no run" if argument.is_dir() else "is no run, folder of runs or pattern"
             raise UserError(f"{argument} {kind}: no config.json is there.")
         found += runs
     return list(dict.fromkeys(found))
-
-
-def _runs_in(place: Path) -> list[Path]:
-    for pattern in ("config.json", "*/config.json", "*/*/config.json"):
-        runs = sorted(file.parent for file in place.glob(pattern))
-        if runs:
-            return runs
-    return []
 
 
 def read(path: Path) -> History:

@@ -66,7 +66,8 @@ def execute(
     shards = choose_shards(setup.config, abstract, options, begun_with)
     plan = train.make_plan(setup.config, chosen.evaluation, options.checkpoints, options.log_every)
     schedule = {"log_every": plan.log_every, "checkpoints": options.checkpoints}
-    facts = describe_process(chosen, setup.engine, shards, vmapped)
+    facts = describe_process(chosen, setup, shards, vmapped)
+    facts["experiment_file"] = str(source.path)
 
     def prepare() -> bool:
         for folder in runs:
@@ -108,12 +109,13 @@ def execute(
 
 
 def describe_process(
-    chosen: Experiment, engine: str, shards: Shards, vmapped: int
+    chosen: Experiment, setup: rundir.Setup, shards: Shards, vmapped: int
 ) -> dict[str, Any]:
     """Returns what the bits depend on besides the settings, as the manifest keeps it."""
     builders = (chosen.build_env, chosen.build_network)
     chosen_by = kernels.how_chosen(jax.default_backend())
-    facts = manifest.collect(engine, builders, chosen_by, shards.number)
+    facts = manifest.collect(setup.engine, builders, chosen_by, shards.number)
+    facts["model"] = rundir.physics_hash(setup.env)
     if vmapped > 1:
         facts["vmapped_seeds"] = {"first": chosen.seed, "number": vmapped}
     return facts
@@ -124,7 +126,7 @@ def compile_programs(
 ) -> compilation.Programs:
     """Compiles what the run calls: on one device, or on those that share the shards."""
     calls_host = setup.engine == "c"
-    with compilation.no_collection():
+    with compilation.no_collection(), rundir.blame(setup.env):
         if shards.number > 1:
             return spread.compile_programs(*setup[:3], evaluation, fresh, shards)
         return compilation.compile_programs(*setup[:3], evaluation, fresh, vmapped, calls_host)

@@ -23,6 +23,7 @@ PACKAGES = ["jax", "jaxlib", "mujoco", "mujoco-mjx", "dm-control", "flax", "opta
 PACKAGES += ["orbax-checkpoint"]
 INFORMATIVE = {"run_id", "git_revision", "git_dirty", "allowed_changes"}
 INFORMATIVE |= {"devices"}  # how many share the shards
+INFORMATIVE |= {"experiment_file"}  # its text is compared itself
 INFORMATIVE |= {"bit_exact", "inexact_because"}  # what they follow from is compared itself
 FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE", "JAX_PLATFORMS", "JAX_ENABLE_X64")
 
@@ -62,7 +63,7 @@ def collect(
             "prng": options["jax_default_prng_impl"],
             "threefry_partitionable": options["jax_threefry_partitionable"],
             "flags": flags(),
-            "source": source_hash(builders),
+            "source": source_hashes(builders),
         }
         | exactness(inexact_because(engine, kernels))
         | _git(Path(__file__).parent)
@@ -129,8 +130,8 @@ def differences(old: Any, new: Any, path: str = "") -> list[str]:
     return [] if old == new else [f"{path}: {old} -> {new}"]
 
 
-def source_hash(builders: Iterable[Callable]) -> str:
-    """Returns a short sha256 over the source that decides a run's bits.
+def source_hashes(builders: Iterable[Callable]) -> dict[str, str]:
+    """Returns a short sha256 of each file of the source that decides a run's bits, by module.
 
     That is: every Python file that the algorithm and the builders import, but for installed
     packages, and the bodies (`assets/*.xml`) beside. An edit of a plot or of another environment
@@ -141,11 +142,11 @@ def source_hash(builders: Iterable[Callable]) -> str:
     files = imported_files(names)
     folders = {file.parent.parent / "assets" for file in files.values()}
     bodies = {f"assets/{f.name}": f for folder in folders for f in folder.rglob("*.xml")}
-    total = hashlib.sha256()
-    # Sorted by name, not by place: a moved checkout is the same source.
-    for name, file in sorted((files | bodies).items()):
-        total.update(name.encode() + b"\0" + file.read_bytes())
-    return total.hexdigest()[:16]
+    # By name, not by place: a moved checkout is the same source.
+    return {
+        name: hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+        for name, file in sorted((files | bodies).items())
+    }
 
 
 def module_of(builder: Callable) -> str:
@@ -208,7 +209,10 @@ def module_file(name: str) -> Path | None:
     that of an engine all of MJX or Warp.
     """
     if name in sys.modules:
-        file = getattr(sys.modules[name], "__file__", None)
+        spec = getattr(sys.modules[name], "__spec__", None)
+        # A run's copy of an experiment says in `__file__` where the original is.
+        file = spec.origin if spec and spec.has_location else None
+        file = file or getattr(sys.modules[name], "__file__", None)
         return Path(file) if file else None
     package, *inside = name.split(".")
     spec = importlib.util.find_spec(package)

@@ -5,6 +5,7 @@ built: never by a literal index.
 """
 
 import difflib
+import hashlib
 from collections.abc import Iterable
 
 import jax.numpy as jnp
@@ -21,6 +22,13 @@ _COUNTS = {"body": "nbody", "joint": "njnt", "geom": "ngeom", "site": "nsite", "
 _COUNTS |= {"actuator": "nu", "tendon": "ntendon", "camera": "ncam"}
 _QPOS_WIDTH = {0: 7, 1: 4, 2: 1, 3: 1}  # by mjtJoint: free, ball, slide, hinge
 _QVEL_WIDTH = {0: 6, 1: 3, 2: 1, 3: 1}
+
+
+def hash_model(model: mujoco.MjModel, rest: tuple = ()) -> str:
+    """Returns a sha256 of a model, all of it, and of the `rest`, as text."""
+    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    return hashlib.sha256(content.tobytes() + repr(rest).encode()).hexdigest()
 
 
 def unknown_name(kind: str, name: str, valid: Iterable[str]) -> str:

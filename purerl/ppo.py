@@ -182,9 +182,12 @@ def rollout_sums(config: Config, transitions: Transition, finished: Finished) ->
 
 
 def rollout_metrics(sums: Metrics) -> Metrics:
-    """Summarises a rollout: sums of counts, means over the episodes that ended in it."""
+    """Summarises a rollout: sums of counts, means over the episodes that ended in it.
+
+    The reward is the mean over sound steps: NaN if there was none.
+    """
     sums = dict(sums)
-    reward = sums.pop("reward") / jnp.maximum(sums.pop("valid"), 1.0)
+    reward = sums.pop("reward") / sums.pop("valid")
     episodes = jnp.maximum(sums["episodes"], 1.0)
     means = {
         k: x / episodes for k, x in sums.items() if k.startswith("episode") and k != "episodes"

@@ -89,6 +89,11 @@ def episode_metric(name: str, total: Array, length: Array) -> Array:
     return total if name.endswith("_count") else total / jnp.maximum(length, 1).astype(jnp.float32)
 
 
+def start_memory(carry: PyTree, number: int) -> PyTree:
+    """Returns the memory of `number` episodes about to start, like a `carry` [B, ...]: zeros."""
+    return jax.tree.map(lambda x: jnp.zeros((number, *x.shape[1:]), x.dtype), carry)
+
+
 def start_episodes(state: State, limit: Array) -> EpisodeStats:
     """Returns the statistics of episodes about to start in `state` [B] with time limits [B]."""
     zeros = jnp.zeros(limit.shape)

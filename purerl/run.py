@@ -66,8 +66,8 @@ class Options:
     video: bool = False
     """Make a video at each evaluation, in a process of low priority (see purerl.render)."""
     cache: bool = True
-    """Keep compiled programs in JAX_COMPILATION_CACHE_DIR, else in purerl/jax in XDG_CACHE_HOME or
-    ~/.cache."""
+    """Whether compiled programs are kept, in JAX_COMPILATION_CACHE_DIR, else in purerl/jax in
+    XDG_CACHE_HOME or ~/.cache."""
 
     def __post_init__(self) -> None:
         """Checks the rules."""

@@ -12,8 +12,8 @@ from typing import IO, Any, NamedTuple
 
 from purerl import checkpoint, compilation, experiment, manifest
 from purerl.config import Config
-from purerl.env import Env
-from purerl.errors import UserError, one_line
+from purerl.env import Env, EnvError, check_members, check_shapes
+from purerl.errors import RunError, UserError, one_line, own_line
 from purerl.experiment import Experiment, Source
 from purerl.loggers import Say
 from purerl.types import Network, TrainState
@@ -41,24 +41,51 @@ class Run(NamedTuple):
 
 
 def build(chosen: Experiment) -> Setup:
-    """Calls the builders; a setting that breaks a rule becomes a UserError."""
+    """Calls the builders; what breaks a rule, of the settings or the protocols, is a UserError."""
     import jax
     import jax.numpy as jnp
 
+    from purerl.networks import check_network
     from purerl.physics import choose_engine
 
     try:
         engine = choose_engine(chosen.engine)
         env = chosen.build_env(chosen.env, engine)
-        state = jax.eval_shape(env.reset, jax.random.key(0))
-        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state.observation)
+        check_members(env)
+        with blame(env):
+            state = jax.eval_shape(env.reset, jax.random.key(0))
+            zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state.observation)
         network = chosen.build_network(chosen.network, zeros, env.action_size)
         setup = Setup(chosen.ppo, env, network, engine)
-        # Sizes that do not fit together show here, in a second.
-        compilation.abstract_state(*setup[:3])
+        with blame(env):
+            check_network(network, zeros, env.action_size)
+            # Sizes that do not fit together show here, in a second.
+            compilation.abstract_state(*setup[:3])
     except (ValueError, ImportError) as error:
         raise UserError(one_line(error)) from error
     return setup
+
+
+@contextlib.contextmanager
+def blame(env: Env) -> Iterator[None]:
+    """Makes one line of programs that cannot be traced because the environment breaks a rule.
+
+    Only then are the rules looked at: that traces a step of the environment, which may take
+    seconds.
+    """
+    try:
+        yield
+    except (UserError, RunError):
+        raise
+    except Exception as error:
+        try:
+            check_shapes(env)
+        except EnvError as broken:
+            what = f"{one_line(broken)}{own_line(broken.__cause__)}"
+            raise UserError(f"The environment {type(env).__name__}: {what}") from error
+        except Exception:
+            pass  # no rule, but an error in its code, of which the first one tells more
+        raise
 
 
 def lock(folder: Path) -> IO[str]:
@@ -161,7 +188,7 @@ def amend(folder: Path, facts: dict[str, Any]) -> None:
     write_json(path, read_json(path) | facts)
 
 
-def restore(folder: Path, update: str, say: Say, engine: str = "") -> Run:
+def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> Run:
     """Rebuilds a run from its folder alone, to see what its policy does; changes nothing in it.
 
     The state comes without `env`, `episode` and `optimizer`: a policy needs none of them, and on
@@ -173,29 +200,66 @@ def restore(folder: Path, update: str, say: Say, engine: str = "") -> Run:
       say: told of damaged checkpoints, and of what is no longer as it was when the run began.
       engine: instead of the run's own, where that one is not at hand.
     """
+    folder = Path(folder)
     if not (folder / "config.json").is_file():
-        raise UserError(f"{folder} is no run: it has no config.json.")
+        inside = ", ".join(map(str, runs_in(folder)))
+        runs = f" Runs in it: {inside}." if inside else ""
+        what = "no run: it has no config.json" if folder.is_dir() else "no folder"
+        raise UserError(f"{folder} is {what}.{runs}")
     settings = read_json(folder / "config.json")
-    source = experiment.load(folder / "experiment.py", settings["experiment"])
+    begun = read_json(folder / "manifest.json")
+    original = Path(begun["experiment_file"]) if "experiment_file" in begun else None
+    source = experiment.load(folder / "experiment.py", settings["experiment"], original)
     filled = fill(settings["settings"], experiment.to_json(source.experiment), say)
     chosen = experiment.from_json(source.experiment, filled)
-    if code_changed(folder, source):
-        say("The code of the environment or the trainer is not that of the run any more.")
     if engine:
         chosen = experiment.from_json(chosen, experiment.to_json(chosen) | {"engine": engine})
     setup = build(chosen)
+    for what in changed_since(begun, source, setup):
+        say(f"{what} is not that of the run any more.")
     abstract = compilation.abstract_state(*setup[:3])
     abstract = abstract.replace(env=None, episode=None, optimizer=None)
     return Run(chosen, setup, _choose(folder / "checkpoints", update, abstract, say), settings)
 
 
-def code_changed(folder: Path, source: Source) -> bool:
-    """Tells whether the code that the run's own file calls has been edited since the run began."""
+def runs_in(place: Path) -> list[Path]:
+    """Returns a run, or the runs in a folder or its folders; [] if there is none."""
+    for pattern in ("config.json", "*/config.json", "*/*/config.json"):
+        runs = sorted(file.parent for file in place.glob(pattern))
+        if runs:
+            return runs
+    return []
+
+
+def changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[str]:
+    """Lists what a policy's doings depend on and is not as it was when the run began.
+
+    Args:
+      begun: the run's manifest.json.
+      source: the run's own copy of its experiment, which cannot have been edited.
+      setup: what it builds now.
+    """
     builders = (source.experiment.build_env, source.experiment.build_network)
-    modules = [manifest.module_of(builder) for builder in builders]
-    if any(manifest.module_file(module) == source.path for module in modules):
-        return False  # it is its own copy of that code
-    return manifest.source_hash(builders) != read_json(folder / "manifest.json").get("source")
+    then, now = begun.get("source"), manifest.source_hashes(builders)
+    then = then if isinstance(then, dict) else {}
+    edited = [name for name, value in now.items() if then.get(name) != value]
+    edited = [name for name in edited if manifest.module_file(name) != source.path]
+    few = ", ".join(edited[:3]) + (f" and {len(edited) - 3} more" if len(edited) > 3 else "")
+    found = [f"The code of {few}"] if edited else []
+    model = physics_hash(setup.env)
+    if setup.engine == begun.get("engine") and model != begun.get("model", model):
+        found.append("MuJoCo's model")
+    return found
+
+
+def physics_hash(env: Env) -> str | None:
+    """Returns a sha256 of the model that an environment simulates; None if it has no `physics`."""
+    model = getattr(getattr(env, "physics", None), "model", None)
+    if model is None:
+        return None
+    from purerl.model import hash_model
+
+    return hash_model(model)
 
 
 def fill(old: Any, new: Any, say: Say, path: str = "") -> Any:

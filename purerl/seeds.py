@@ -44,9 +44,7 @@ def train_together(
         saved: list[checkpoint.Saved] = []
 
         def find() -> dict[str, Any]:
-            saved.extend(checkpoint.newest_of_all(places, abstract, progress.say))
-            if not saved:
-                checkpoint.check_none_lost(places)
+            saved.extend(find_saved(places, abstract, options.resume, progress.say))
             known = saved[0].meta if saved else {"wall_s": 0.0, "update": 0}
             return {name: known[name] for name in ("wall_s", "update")} | {"found": bool(saved)}
 
@@ -84,6 +82,18 @@ def train_together(
         for folder, recorder in zip(folders, recorders, strict=True):
             of = f" of {folder.name}" if options.num_seeds > 1 else ""
             progress.say(f"Done: {plan.steps:,} steps{of}. Digest {recorder.digest}")
+
+
+def find_saved(
+    places: list[Path], abstract: PyTree, resume: bool, say: Say
+) -> list[checkpoint.Saved]:
+    """Returns the newest checkpoint that all `places` have, one each; [] if there is none yet."""
+    saved = checkpoint.newest_of_all(places, abstract, say)
+    if not saved:
+        checkpoint.check_none_lost(places)
+        if resume:
+            say(f"There is no checkpoint in {places[0]}: it begins anew.")
+    return saved
 
 
 def first_state(

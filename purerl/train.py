@@ -182,16 +182,19 @@ def make_records(
 
 
 def shown_record(records: Sequence[Record]) -> Record:
-    """Returns what progress shows: a run's own line, of many seeds with their mean return."""
+    """Returns what progress shows: a run's own line, of many seeds their mean return, all lost."""
     returns = [r["train/episode_return"] for r in records]
     known = [value for value in returns if value is not None]
-    return records[0] | {"train/episode_return": sum(known) / len(known) if known else None}
+    return records[0] | {
+        "train/episode_return": sum(known) / len(known) if known else None,
+        "train/nonfinite_resets": sum(r["train/nonfinite_resets"] for r in records),
+    }
 
 
 def check_finite(
     state: TrainState, records: Sequence[Record], recorders: Sequence[Recorder]
 ) -> None:
-    """Raises RunError when parameters are not finite, or every minibatch of late was skipped.
+    """Raises RunError when parameters are not finite, or nothing of late could be learnt from.
 
     Vmapped seeds stop together: they resume together, and a seed that is lost cannot be saved.
     """
@@ -201,6 +204,12 @@ def check_finite(
             bad = [k for k, x in params.items() if not np.isfinite(x.astype(np.float64)).all()]
             reason = f"Parameters are not finite: {', '.join(bad) or 'their norm overflows'}. "
             _give_up(i, records, recorders, reason + "Lower ppo.learning_rate.")
+        if math.isnan(record["train/reward"]):
+            reason = (
+                "No step of an update was sound: of each, some number of the state is NaN or "
+                "absurd. `purerl.env.check_env(env)` tells which."
+            )
+            _give_up(i, records, recorders, reason)
         skipped = record["train/skipped_in_a_row"]
         if skipped >= MAX_SKIPPED_IN_A_ROW:
             reason = (
@@ -251,8 +260,9 @@ def describe_evaluation(records: Sequence[Record], plan: Plan) -> str:
     if len(records) > 1:
         spread = np.std([record["eval/episode_return"] for record in records])
         over = f" over {len(records)} seeds"
+    lost = mean["eval/lost"]
     return (
         f"update {records[0]['update']}/{plan.updates}  steps {records[0]['steps']:,}  evaluation: "
         f"return {mean['eval/episode_return']:.2f} +- {spread:.2f}{over}, "
-        f"episode length {mean['eval/episode_length']:.0f}"
+        f"episode length {mean['eval/episode_length']:.0f}" + (f", {lost:.0%} lost" if lost else "")
     )

@@ -21,7 +21,7 @@ from purerl.env import Env, State
 from purerl.errors import UserError
 from purerl.keys import per_environment
 from purerl.physics import Physics
-from purerl.rollout import act, is_lost, one_control_step, select, start_episodes
+from purerl.rollout import act, is_lost, one_control_step, select, start_episodes, start_memory
 from purerl.types import Array, EpisodeStats, Network, PyTree, TrainState
 
 MAX_FRAMES_PER_SECOND = 50.0
@@ -88,7 +88,7 @@ def record(
     """
     start = jax.vmap(env.reset)(per_environment(key, num_episodes))
     limit = jnp.full(num_episodes, config.episode_length, jnp.int32)
-    memory = jax.tree.map(lambda x: jnp.zeros((num_episodes, *x.shape[1:]), x.dtype), state.carry)
+    memory = start_memory(state.carry, num_episodes)
     moment = Moment(start, start_episodes(start, limit), jnp.zeros(num_episodes, bool))
 
     def step(carry: tuple[Moment, PyTree], _: None) -> tuple[tuple[Moment, PyTree], Any]:

@@ -45,7 +45,7 @@ def test_the_source_is_what_the_run_imports_and_nothing_else():
     assert not {"purerl.console", "tests.test_run", "jax"} & set(found)
 
 
-def test_an_edit_changes_the_source_hash(tmp_path, monkeypatch):
+def test_an_edit_changes_the_source_hashes(tmp_path, monkeypatch):
     package = tmp_path / "bodies_and_tasks"
     package.mkdir()
     (package / "__init__.py").write_text("")
@@ -62,16 +62,16 @@ def test_an_edit_changes_the_source_hash(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     import bodies_and_tasks.task as task
 
-    before = manifest.source_hash([task.build])
-    assert manifest.source_hash([functools.partial(task.build)]) == before
+    before = manifest.source_hashes([task.build])
+    assert manifest.source_hashes([functools.partial(task.build)]) == before
     (package / "other.py").write_text("LEGS = 8\n")
-    assert manifest.source_hash([task.build]) == before
+    assert manifest.source_hashes([task.build]) == before
     (tmp_path / "my_rewards.py").write_text("UPRIGHT = 2\n")
-    assert (after := manifest.source_hash([task.build])) != before
+    assert (after := manifest.source_hashes([task.build])) != before
     (installed / "simulator.py").write_text("")
-    assert manifest.source_hash([task.build]) == after
+    assert manifest.source_hashes([task.build]) == after
     (package / "body.py").write_text("LEGS = 6\n")
-    assert manifest.source_hash([task.build]) not in (before, after)
+    assert manifest.source_hashes([task.build]) not in (before, after)
 
 
 def test_a_manifest_says_whether_the_run_is_exact_and_what_prevents_it(monkeypatch):

@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from purerl import checkpoint, compilation, launch, recorder, run, snapshot
+from purerl import checkpoint, compilation, launch, recorder, run, snapshot, train
 from purerl.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE, RunError, UserError
 from tests.test_run import ROOT, TOY, Stopper, digest, folder, lines, start
 
@@ -179,3 +179,10 @@ def test_a_lost_seed_is_named(tmp_path, stop_after, capsys):
 def test_the_number_of_seeds_has_a_rule(tmp_path, capsys):
     assert start(tmp_path, "--num-seeds", "0") == USAGE
     assert "num_seeds is 0; it must be at least 1" in capsys.readouterr().err
+
+
+def test_progress_of_seeds_shows_their_mean_return_and_all_that_was_lost():
+    names = ("train/episode_return", "train/nonfinite_resets", "update")
+    rows = [(1.0, 0.0, 3), (None, 2.0, 3), (2.0, 5.0, 3)]
+    records = [dict(zip(names, row, strict=True)) for row in rows]
+    assert list(train.shown_record(records).values()) == [1.5, 7.0, 3]
