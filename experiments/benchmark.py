@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 
 from experiments import start_up
-from purerl import cli, kernels, learner, ppo, run, rundir
+from purerl import building, cli, kernels, learner, ppo, run
 from purerl.console import size
 from purerl.errors import leave, output_file
 from purerl.evaluation import evaluate
@@ -94,7 +94,7 @@ def bare_physics(env: Any, config: ppo.Config, state: TrainState, key: Array) ->
 
 def make_bench(experiment: Experiment, names: Sequence[str] = PARTS) -> Bench:
     """Compiles the parts of an experiment on its engine."""
-    config, env, network, _ = rundir.build(experiment)
+    config, env, network, _ = building.build(experiment)
     key = jax.random.key(experiment.seed)
     state = jax.jit(partial(ppo.init, config, env, network))(key)
     seen = None

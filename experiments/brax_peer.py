@@ -36,7 +36,7 @@ from envs import brax_env
 from experiments import brax_network
 from experiments.benchmark import Part, measure
 from experiments.peers import Ours
-from purerl import compilation, kernels, rundir
+from purerl import building, compilation, kernels
 from purerl.config import Config
 from purerl.errors import leave, output_file
 from purerl.experiment import Evaluation, Experiment
@@ -131,7 +131,7 @@ def physics_alone(env: Any, num_steps: int, start: PyTree, key: Array) -> Array:
 
 def our_parts(chosen: Experiment) -> list[Part]:
     """Compiles the physics alone and our training, side by side, and makes the first update."""
-    config, env, network, _ = rundir.build(chosen)
+    config, env, network, _ = building.build(chosen)
     key = jax.random.key(chosen.seed)
     abstract = compilation.abstract_state(config, env, network).env.physics
     bare: Callable = partial(physics_alone, env, config.rollout_length)

@@ -29,7 +29,7 @@ import jax
 import numpy as np
 
 from experiments.brax_peer import BODIES, Published, our_experiment, resize, train_brax
-from purerl import compilation, kernels, rundir, statistics
+from purerl import building, compilation, kernels, statistics
 from purerl.compilation import Programs
 from purerl.errors import UserError, leave, output_file
 from purerl.experiment import Evaluation
@@ -95,7 +95,7 @@ def run_brax(task: Task, seed: int) -> Run:
 def our_programs(task: Task, physics: str) -> Programs:
     """Compiles our training, once in a process."""
     chosen = our_experiment(task.body, physics, task.sizes, task.steps)
-    config, env, network, _ = rundir.build(chosen)
+    config, env, network, _ = building.build(chosen)
     evaluation = Evaluation(num_episodes=NUM_EPISODES)
     return compilation.compile_programs(config, env, network, evaluation, fresh=True)
 

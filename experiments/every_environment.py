@@ -16,7 +16,7 @@ import jax
 from envs.suite.tasks import TASKS
 from envs.suite.tasks import Options as SuiteOptions
 from experiments.benchmark import bare_physics, compile_part, measure
-from purerl import ppo, rundir
+from purerl import building, ppo
 from purerl.env import check_env
 from purerl.errors import UserError, leave, one_line
 from purerl.experiment import Experiment, find
@@ -45,7 +45,7 @@ def sized(experiment: Experiment, engine: str, num_envs: int, length: int) -> Ex
 
 def row(name: str, experiment: Experiment, engine: str, rounds: int) -> str:
     """Checks and times one environment on one engine."""
-    config, env, network, _ = rundir.build(experiment)
+    config, env, network, _ = building.build(experiment)
     check_env(env, num_envs=2, num_steps=2)
     key = jax.random.key(experiment.seed)
     state = jax.jit(partial(ppo.init, config, env, network))(key)

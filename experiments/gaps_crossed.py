@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from purerl import rundir
+from purerl import building, rundir
 from purerl.compilation import set_up_jax
 from purerl.errors import UserError, leave
 from purerl.evaluation import evaluate
@@ -23,7 +23,7 @@ from purerl.keys import Purpose, derive
 from purerl.types import Array, Network, Normal, PolicyOutput, TrainState
 
 
-def gaps_of(setup: rundir.Setup, state: TrainState, seed: int, episodes: int) -> dict[str, Any]:
+def gaps_of(setup: building.Setup, state: TrainState, seed: int, episodes: int) -> dict[str, Any]:
     """Evaluates deterministically in `episodes` corridors; the same seed gives the same ones."""
 
     def judge(state: TrainState, key: Array) -> dict[str, Array]:

@@ -30,7 +30,7 @@ import jax
 
 from experiments.benchmark import Part, Timing, measure
 from experiments.gymnasium_ant import experiment
-from purerl import ppo, rundir
+from purerl import building, ppo
 from purerl.config import Config
 from purerl.errors import leave, output_file
 from purerl.networks import MlpOptions
@@ -84,7 +84,7 @@ def our_network(sizes: Sizes) -> MlpOptions:
 def ours(sizes: Sizes) -> Part:
     """Compiles purerl's training and makes its first update."""
     chosen = replace(experiment, ppo=our_config(sizes), network=our_network(sizes))
-    config, env, network, engine = rundir.build(chosen)
+    config, env, network, engine = building.build(chosen)
     state = jax.jit(partial(ppo.init, config, env, network))(jax.random.key(chosen.seed))
     update = jax.jit(partial(ppo.update, config, env, network), donate_argnums=0)
     trainer = Ours(update, state)

@@ -34,7 +34,7 @@ import flax.linen as nn
 import jax
 import numpy as np
 
-from purerl import rundir, snapshot
+from purerl import building, rundir, snapshot
 from purerl.compilation import set_up_jax
 from purerl.errors import UserError, leave, output_file
 from purerl.evaluation import Progress, advance, start
@@ -61,7 +61,7 @@ def note_modules(noted: dict[str, Array]) -> Callable[..., Any]:
     return intercept
 
 
-def play(setup: rundir.Setup, state: TrainState, key: Array, number: int) -> dict[str, Any]:
+def play(setup: building.Setup, state: TrainState, key: Array, number: int) -> dict[str, Any]:
     """Plays N whole episodes by the deterministic policy; pure. Returns arrays [T, N, ...]."""
     config, env, network, _ = setup
     reset_key, _ = jax.random.split(key)  # as `evaluation.evaluate` does: the same beginnings
@@ -89,7 +89,7 @@ def play(setup: rundir.Setup, state: TrainState, key: Array, number: int) -> dic
     return jax.lax.scan(step, start(config, env, state, reset_key, number), length=steps)[1]
 
 
-def record(setup: rundir.Setup, state: TrainState, seed: int, number: int) -> snapshot.Leaves:
+def record(setup: building.Setup, state: TrainState, seed: int, number: int) -> snapshot.Leaves:
     """Returns the arrays of N episodes by name, [N, T, ...], and their `length` [N]."""
     key = derive(jax.random.key(seed), Purpose.EVALUATION)
     rows = jax.jit(lambda state, key: play(setup, state, key, number))(state, key)

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import jax
 
 from experiments.benchmark import compile_part, measure
-from purerl import cli, kernels, ppo, run, rundir
+from purerl import building, cli, kernels, ppo, run
 from purerl.errors import UserError, leave, output_file
 from purerl.experiment import Experiment, find
 
@@ -107,7 +107,7 @@ def run_on(cores: int, command: list[str]) -> int:
 def seeds_point(experiment: Experiment, engine: str, number: int) -> dict[str, Any]:
     """Measures the update of vmapped seeds."""
     chosen = dataclasses.replace(experiment, engine=engine)
-    config, env, network, _ = rundir.build(chosen)
+    config, env, network, _ = building.build(chosen)
     keys = jax.random.split(jax.random.key(chosen.seed), number)
     state = jax.jit(jax.vmap(partial(ppo.init, config, env, network)))(keys)
     update = jax.vmap(partial(ppo.update, config, env, network))

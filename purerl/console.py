@@ -9,8 +9,8 @@ from typing import Any
 
 import jax
 
+from purerl.building import Setup
 from purerl.loggers import Record
-from purerl.rundir import Setup
 from purerl.train import Plan
 from purerl.types import PyTree
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 
 from purerl import (
+    building,
     checkpoint,
     compilation,
     console,
@@ -60,7 +61,7 @@ def execute(
     loggers = needed_loggers(options)
     cache = compilation.set_up_jax(options.cache)
     with compilation.no_collection():
-        setup = rundir.build(chosen)
+        setup = building.build(chosen)
         abstract = compilation.abstract_state(*setup[:3])
     begun_with = alone(lambda: shards_on_disk(runs))
     shards = choose_shards(setup.config, abstract, options, begun_with)
@@ -109,24 +110,24 @@ def execute(
 
 
 def describe_process(
-    chosen: Experiment, setup: rundir.Setup, shards: Shards, vmapped: int
+    chosen: Experiment, setup: building.Setup, shards: Shards, vmapped: int
 ) -> dict[str, Any]:
     """Returns what the bits depend on besides the settings, as the manifest keeps it."""
     builders = (chosen.build_env, chosen.build_network)
     chosen_by = kernels.how_chosen(jax.default_backend())
     facts = manifest.collect(setup.engine, builders, chosen_by, shards.number)
-    facts["model"] = rundir.physics_hash(setup.env)
+    facts["model"] = building.physics_hash(setup.env)
     if vmapped > 1:
         facts["vmapped_seeds"] = {"first": chosen.seed, "number": vmapped}
     return facts
 
 
 def compile_programs(
-    setup: rundir.Setup, evaluation: Evaluation, fresh: bool, vmapped: int, shards: Shards
+    setup: building.Setup, evaluation: Evaluation, fresh: bool, vmapped: int, shards: Shards
 ) -> compilation.Programs:
     """Compiles what the run calls: on one device, or on those that share the shards."""
     calls_host = setup.engine == "c"
-    with compilation.no_collection(), rundir.blame(setup.env):
+    with compilation.no_collection(), building.blame(setup.env):
         if shards.number > 1:
             return spread.compile_programs(*setup[:3], evaluation, fresh, shards)
         return compilation.compile_programs(*setup[:3], evaluation, fresh, vmapped, calls_host)

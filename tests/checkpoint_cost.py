@@ -16,7 +16,7 @@ from typing import Any
 
 import jax
 
-from purerl import checkpoint, compilation, console, experiment, ppo, rundir, snapshot
+from purerl import building, checkpoint, compilation, console, experiment, ppo, snapshot
 from purerl.cli import parse
 from purerl.launch import set_up_jax
 from purerl.run import from_command_line
@@ -35,7 +35,7 @@ def main() -> None:
     source = experiment.find(words[0])
     chosen, _ = from_command_line(parse, source, words[1:], "tests.checkpoint_cost")
     set_up_jax(True)
-    setup = rundir.build(chosen)
+    setup = building.build(chosen)
     state = jax.jit(functools.partial(ppo.init, *setup[:3]))(jax.random.key(1))
     abstract = compilation.abstract_state(*setup[:3])
     jax.block_until_ready(state)

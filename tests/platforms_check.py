@@ -20,10 +20,10 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from purerl import cli, kernels, ppo, run, rundir, snapshot
+from purerl import building, cli, kernels, ppo, run, snapshot
+from purerl.building import Setup
 from purerl.errors import leave
 from purerl.experiment import find
-from purerl.rundir import Setup
 from purerl.types import PyTree
 
 ROWS = 12  # shown
@@ -44,7 +44,7 @@ def main(arguments: list[str]) -> int:
     jax.config.update("jax_default_matmul_precision", precision)
     prog = f"python -m tests.platforms_check {options.experiment}"
     experiment, _ = run.from_command_line(cli.parse, find(options.experiment), overrides, prog)
-    setup = rundir.build(experiment)
+    setup = building.build(experiment)
     if options.write:
         np.savez(options.write, **snapshot.flatten(make(setup)))
         return 0

@@ -9,6 +9,7 @@ ROOT = Path(__file__).parent.parent
 FILES = {path.stem: path for path in (ROOT / "purerl").glob("*.py")}
 # Effects live in these; whatever is not named here is pure, and imports nothing of these.
 EFFECTS = {
+    "building",
     "checkpoint",
     "cli",
     "compare",

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import pytest
 
 from purerl import compilation, kernels, manifest, ppo
+from purerl.building import build
 from purerl.deterministic import list_scatter_sums
 from purerl.experiment import Evaluation, load
-from purerl.rundir import build
 from tests.test_run import ROOT, TOY
 
 
@@ -149,9 +149,9 @@ def test_a_run_on_c_imports_no_other_engine():
     """MJX takes most of a second to import, Warp two; a run on engine `c` needs neither."""
     lines = [
         "import sys",
-        "from purerl import experiment, manifest, rundir",
+        "from purerl import building, experiment, manifest",
         "chosen = experiment.find('ant_run').experiment",
-        "setup = rundir.build(chosen)",
+        "setup = building.build(chosen)",
         "manifest.collect(setup.engine, [chosen.build_env, chosen.build_network])",
         "assert setup.engine == 'c'",
         "print([name for name in sys.modules if name in ('mujoco.mjx', 'warp')])",

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 
-from purerl import ppo, rundir
+from purerl import building, ppo
 from tests import platforms_check, toy_experiment
 from tests.test_run import TOY
 
@@ -11,7 +11,7 @@ from tests.test_run import TOY
 def test_what_is_learned_otherwise_is_named(tmp_path, monkeypatch):
     file = tmp_path / "there.npz"
     platforms_check.ask_cpu([str(TOY), "--write", str(file)])
-    setup, there = rundir.build(toy_experiment.experiment), dict(np.load(file))
+    setup, there = building.build(toy_experiment.experiment), dict(np.load(file))
     assert platforms_check.compare(setup, there) == {}
     improve = ppo.improve
 

@@ -17,6 +17,7 @@ import jax
 import pytest
 
 from purerl import (
+    building,
     checkpoint,
     compilation,
     console,
@@ -31,7 +32,6 @@ from purerl import (
 from purerl.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
 from purerl.experiment import Evaluation, find, load
 from purerl.shards import Shards
-from tests import quick
 
 TOY = Path(__file__).parent / "toy_experiment.py"
 ROOT = TOY.parent.parent
@@ -62,7 +62,6 @@ def spawn(runs: Path, *words: str) -> subprocess.Popen:
     return subprocess.Popen(
         [sys.executable, "-m", "purerl.run", str(TOY), "--runs", str(runs), *words],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env=quick.cached(),
     )  # fmt: skip
 
 
@@ -210,7 +209,7 @@ def test_a_run_killed_in_its_first_save_begins_as_it_did(whole, tmp_path, stop_a
 def test_a_beginning_has_the_same_bits_however_it_is_compiled(num_shards):
     chosen = find("cartpole_swingup").experiment
     chosen = dataclasses.replace(chosen, engine="c", evaluation=Evaluation(number=0))
-    setup = rundir.build(chosen)
+    setup = building.build(chosen)
     digests = set()
     for fresh in (True, False):  # ahead of time, or when it is called
         programs = launch.compile_programs(
