@@ -7,13 +7,13 @@ import tempfile
 # on the number of cores; it must be set before JAX starts.
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
 
+# Compiling takes most of the time of these tests: it is done once for all their processes.
+COMPILED = os.path.join(tempfile.gettempdir(), "purerl-test-compilations")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", COMPILED)
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
 import jax  # noqa: E402
 
-# Compiling MJX takes most of the time of these tests.
-jax.config.update(
-    "jax_compilation_cache_dir", os.path.join(tempfile.gettempdir(), "purerl-test-compilations")
-)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_debug_key_reuse", True)  # a key consumed twice raises
 
 # Files that take a minute or more, the longest first: begun last, one would run alone at the end.

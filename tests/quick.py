@@ -1,7 +1,6 @@
-"""Compiling in half the time what a test runs a few times, and only once for all."""
+"""Compiling in half the time what a test runs a few times."""
 
 import functools
-import os
 
 import jax
 
@@ -12,11 +11,3 @@ if jax.__version_info__ < (0, 11):
     OPTIONS["xla_cpu_use_fusion_emitters"] = False
 
 jit = functools.partial(jax.jit, compiler_options=OPTIONS)
-
-
-def cached() -> dict[str, str]:
-    """Returns an environment in which all tests' processes share what they compiled."""
-    return os.environ | {
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        "JAX_COMPILATION_CACHE_DIR": jax.config.values["jax_compilation_cache_dir"],
-    }

@@ -52,7 +52,7 @@ def test_a_second_process_finds_its_program_compiled(trained, tmp_path):
         "evaluate.main(sys.argv[1:]);"
         "print(hits.count('/jax/compilation_cache/cache_hits'))"
     )
-    own = {"XDG_CACHE_HOME": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    own = {"XDG_CACHE_HOME": str(tmp_path), "JAX_COMPILATION_CACHE_DIR": ""}
     command = [sys.executable, "-c", watch, str(trained), "--episodes", "3"]
 
     def start() -> list[str]:

@@ -57,9 +57,8 @@ def lstm(tmp_path_factory) -> Recorded:
     return train_and_record(tmp_path_factory.mktemp("lstm"), "recurrent", LSTM)
 
 
-@pytest.mark.parametrize("kind", ["mlp", "lstm"])
-def test_its_episodes_begin_as_those_of_an_evaluation(kind, request, tmp_path):
-    folder, arrays, _ = request.getfixturevalue(kind)
+def test_its_episodes_begin_as_those_of_an_evaluation(lstm, tmp_path):
+    folder, arrays, _ = lstm
     file = tmp_path / "judged.json"
     words = ["--episodes", "3", "--seed", "5", "--json", str(file)]
     assert evaluate.main([str(folder), *words]) == 0
