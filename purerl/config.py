@@ -131,7 +131,9 @@ def check_pool(config: Config) -> None:
         )
 
 
-def check_divides(whole_name: str, whole: int, parts_name: str, parts: int) -> None:
+def check_divides(
+    whole_name: str, whole: int, parts_name: str, parts: int, because: str = ""
+) -> None:
     """Raises ValueError, with the nearest sizes that do, unless `parts` divides `whole`."""
     if whole % parts == 0:
         return
@@ -142,4 +144,5 @@ def check_divides(whole_name: str, whole: int, parts_name: str, parts: int) -> N
         f"{parts_name} = {parts} does not divide {whole_name} = {whole}; "
         f"{parts_name} could be {', '.join(map(str, nearest))}, "
         f"or {whole_name} could be {' or '.join(str(w) for w in (below, above) if w > 0)}."
+        + because
     )

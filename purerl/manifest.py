@@ -21,7 +21,7 @@ from typing import Any
 
 PACKAGES = ["jax", "jaxlib", "mujoco", "mujoco-mjx", "dm-control", "flax", "optax", "numpy"]
 PACKAGES += ["orbax-checkpoint"]
-INFORMATIVE = {"run_id", "git_revision", "git_dirty", "allowed_changes"}
+INFORMATIVE = {"run_id", "name", "git_revision", "git_dirty", "allowed_changes"}
 INFORMATIVE |= {"devices"}  # how many share the shards
 INFORMATIVE |= {"experiment_file"}  # its text is compared itself
 INFORMATIVE |= {"bit_exact", "inexact_because"}  # what they follow from is compared itself

@@ -52,11 +52,13 @@ def check_sizes(config: Config, carry: PyTree, number: int = 1) -> None:
             f"segment_length is {config.segment_length}, and the network is recurrent, so that its "
             "minibatches hold whole rollouts; segment_length must be 0."
         )
+    because = " The minibatches of a recurrent network hold whole rollouts."
     if not is_recurrent(carry):
+        because = ""
         size, name = size * config.rollout_length, f"{name} * rollout_length"
     if config.segment_length:
         size, name = size // config.segment_length, f"{name} / segment_length"
-    check_divides(name, size, "num_minibatches", config.num_minibatches)
+    check_divides(name, size, "num_minibatches", config.num_minibatches, because)
 
 
 def init(config: Config, env: Env, network: Network, key: Array) -> TrainState:

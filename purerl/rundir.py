@@ -96,8 +96,13 @@ def describe(source: Source, chosen: Experiment, schedule: dict[str, Any]) -> di
 def start(folder: Path, source: Source, settings: dict[str, Any], facts: dict[str, Any]) -> None:
     """Writes the three files that describe a new run; config.json last, it makes it a run."""
     shutil.copyfile(source.path, folder / "experiment.py")
-    write_json(folder / "manifest.json", {"run_id": uuid.uuid4().hex[:12]} | facts)
+    write_json(folder / "manifest.json", identity(folder) | facts)
     write_json(folder / "config.json", settings)
+
+
+def identity(folder: Path) -> dict[str, str]:
+    """Returns what tells a new run from all others: a random id, and the folder's name."""
+    return {"run_id": uuid.uuid4().hex[:12], "name": folder.name}
 
 
 def check_same(
@@ -114,11 +119,17 @@ def check_same(
 def accept_changes(
     folder: Path, source: Source, settings: dict[str, Any], facts: dict[str, Any], found: list[str]
 ) -> None:
-    """Writes down that the run goes on under other conditions, after which update, and as what."""
+    """Writes down that the run goes on under other conditions, after which update, and as what.
+
+    A copy under another name is a run of its own, which loggers must not take for the first one.
+    """
     old = read_json(folder / "manifest.json")
-    entry = {"after_update": max(checkpoint.updates(folder / "checkpoints"), default=0)}
-    history = [*old.get("allowed_changes", []), entry | {"changes": found}]
-    kept = {"run_id": old.get("run_id", ""), "allowed_changes": history}
+    known = {"run_id": old.get("run_id", ""), "name": old.get("name", folder.name)}
+    after = max(checkpoint.updates(folder / "checkpoints"), default=0)
+    entry: dict[str, Any] = {"after_update": after, "changes": found}
+    if known["name"] != folder.name:
+        entry, known = {"of": known} | entry, identity(folder)
+    kept = known | {"allowed_changes": [*old.get("allowed_changes", []), entry]}
     shutil.copyfile(source.path, folder / "experiment.py")
     write_json(folder / "manifest.json", facts | kept)
     write_json(folder / "config.json", settings)

@@ -592,7 +592,7 @@ def test_impossible_settings_are_refused(changes, words):
     ("recurrent", "minibatches", "words"),
     [
         (False, 7, ("num_minibatches = 7", "num_envs * rollout_length = 96", "6, 8", "91 or 98")),
-        (True, 4, ("num_minibatches = 4", "num_envs = 6", "3", "4 or 8")),
+        (True, 4, ("num_minibatches = 4", "num_envs = 6", "3", "4 or 8", "recurrent")),
     ],
 )
 def test_sizes_that_do_not_divide(recurrent, minibatches, words):

@@ -443,6 +443,22 @@ def test_a_run_begun_under_other_conditions_lists_them(tmp_path, stop_after, cap
     assert start(tmp_path, *words, "--allow-changes") == SUCCESS
     allowed = json.loads(file.read_text())["allowed_changes"]
     assert allowed[0]["after_update"] > 0 and len(allowed[0]["changes"]) == 2
+    assert json.loads(file.read_text())["run_id"] == facts["run_id"] and "of" not in allowed[0]
+
+
+def test_a_copy_that_goes_on_otherwise_is_a_run_of_its_own(tmp_path):
+    start(tmp_path)
+    first = json.loads((folder(tmp_path) / "manifest.json").read_text())
+    copy = folder(tmp_path).with_name("wide")
+    shutil.copytree(folder(tmp_path), copy)
+    words = ["--name", "wide", "--resume", "--allow-changes", "--ppo.learning-rate", "1e-3"]
+    for _ in range(2):  # and stays it
+        assert start(tmp_path, *words) == SUCCESS
+        second = json.loads((copy / "manifest.json").read_text())
+        assert second["run_id"] != first["run_id"] and second["name"] == "wide"
+        (change,) = second["allowed_changes"]
+        assert change["of"] == {"run_id": first["run_id"], "name": "seed1"}
+    assert json.loads((folder(tmp_path) / "manifest.json").read_text()) == first
 
 
 def test_changes_that_no_checkpoint_fits_leave_the_run_as_it_was(tmp_path, stop_after, capsys):

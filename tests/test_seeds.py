@@ -67,7 +67,9 @@ def test_mapped_seeds_are_single_runs_bit_for_bit(tmp_path, experiment, words):
     found = [[json.loads(x) for x in (f / "metrics.jsonl").open()] for f in files]
     many, single, other = [[line | {"wall_s": 0} for line in lines] for lines in found]
     assert many == single != other
-    facts = [json.loads((f / "manifest.json").read_text()) | {"run_id": ""} for f in files]
+    facts = [
+        json.loads((f / "manifest.json").read_text()) | {"run_id": "", "name": ""} for f in files
+    ]
     assert facts[0] == facts[1]
     assert (files[0] / "config.json").read_text() == (files[1] / "config.json").read_text()
 
