@@ -4,11 +4,15 @@ import contextlib
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
+
 from purerl import compilation
 from purerl.config import Config
 from purerl.env import Env, EnvError, check_members, check_shapes
 from purerl.errors import RunError, UserError, one_line, own_line
 from purerl.experiment import Experiment
+from purerl.networks import check_network
 from purerl.types import Network
 
 
@@ -23,10 +27,7 @@ class Setup(NamedTuple):
 
 def build(chosen: Experiment) -> Setup:
     """Calls the builders; what breaks a rule, of the settings or the protocols, is a UserError."""
-    import jax
-    import jax.numpy as jnp
-
-    from purerl.networks import check_network
+    # Imported here, as below: `compare` reads runs, and needs no MuJoCo.
     from purerl.physics import choose_engine
 
     try:

@@ -52,9 +52,10 @@ def check_sizes(config: Config, carry: PyTree, number: int = 1) -> None:
             f"segment_length is {config.segment_length}, and the network is recurrent, so that its "
             "minibatches hold whole rollouts; segment_length must be 0."
         )
-    because = " The minibatches of a recurrent network hold whole rollouts."
-    if not is_recurrent(carry):
-        because = ""
+    because = ""
+    if is_recurrent(carry):
+        because = " The minibatches of a recurrent network hold whole rollouts."
+    else:
         size, name = size * config.rollout_length, f"{name} * rollout_length"
     if config.segment_length:
         size, name = size // config.segment_length, f"{name} / segment_length"

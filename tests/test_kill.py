@@ -10,7 +10,7 @@ LONG = [str(TOY), "--ppo.num-steps", "4800", "--checkpoints", "15"]
 
 @pytest.mark.parametrize(
     ("words", "kills"),
-    [(LONG, 2), ([*LONG, "--num-seeds", "3", "--keep", "1"], 1)],
+    [(LONG, 2), ([*LONG, "--num-seeds", "3", "--keep", "1"], 2)],
     ids=["one run", "vmapped seeds"],
 )
 def test_killed_runs_end_as_undisturbed_ones(tmp_path, words, kills):

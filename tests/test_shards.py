@@ -79,8 +79,9 @@ def toy(tmp_path_factory) -> Path:
     return runs / "toy_experiment" / "seed1"
 
 
-def test_a_run_is_the_same_on_as_many_devices_as_shards(toy, tmp_path):
-    start(tmp_path, 8, *EIGHT)
+@pytest.mark.parametrize("devices", [2, 8])
+def test_a_run_is_the_same_on_any_number_of_devices(toy, tmp_path, devices):
+    start(tmp_path, devices, *EIGHT)
     assert lines(tmp_path / "toy_experiment" / "seed1") == lines(toy)
 
 
@@ -97,7 +98,7 @@ def test_physics_is_the_same_on_any_number_of_devices(tmp_path, engine):
 
 
 def test_a_run_goes_on_with_another_number_of_devices(toy, tmp_path):
-    """From 4 to 2, as on one. Without --num-shards: the run says how many it was begun with."""
+    """Without --num-shards: the run says how many it was begun with."""
     words = [str(TOY), "--ppo.num-envs", "16", "--checkpoints", "3"]
     start(tmp_path, 4, *words, "--num-shards", "8")
     folder = tmp_path / "toy_experiment" / "seed1"
