@@ -1,0 +1,24 @@
+"""A cart-pole and a network with memory."""
+
+from envs import cartpole_swingup
+from purerl import networks
+from purerl.config import Config
+from purerl.experiment import Evaluation, Experiment
+
+experiment = Experiment(
+    build_env=cartpole_swingup.build,
+    env=cartpole_swingup.Options(),
+    build_network=networks.recurrent,
+    network=networks.RecurrentOptions(cell="lstm", hidden=16, encoder=(16,), value_hidden=(16,)),
+    ppo=Config(
+        num_steps=768,
+        num_envs=16,
+        rollout_length=16,
+        num_epochs=2,
+        num_minibatches=2,
+        episode_length=20,
+        entropy_weight=0.01,
+        schedule="adaptive_kl",
+    ),
+    evaluation=Evaluation(num_episodes=4, number=1),
+)
