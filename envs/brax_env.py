@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import mujoco
 from flax import struct
 
-from purerl.env import State
-from purerl.folding import on_cpu
-from purerl.physics import Physics, PhysicsState
-from purerl.types import Array, PyTree
+from purerl.core.env import State
+from purerl.core.records import Array, PyTree
+from purerl.exact.constants import on_cpu
+from purerl.physics.interface import Physics, PhysicsState
 
 READINGS = ("xpos", "xquat", "cvel", "subtree_com")
 

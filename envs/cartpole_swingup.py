@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from purerl import model as lookup
-from purerl.env import State
-from purerl.physics import Physics, PhysicsState
-from purerl.types import Array
+from purerl.core.env import State
+from purerl.core.records import Array
+from purerl.physics import lookup
+from purerl.physics.interface import Physics, PhysicsState
 
 XML = Path(__file__).parent.parent / "assets" / "cartpole.xml"
 
@@ -98,7 +98,7 @@ def _bump(position: Array) -> Array:
 
 
 def build(options: Options = Options(), engine: str = "auto") -> CartpoleSwingup:  # noqa: B008
-    """Builds the environment on an engine of `purerl.physics`."""
+    """Builds the environment on an engine of `purerl.physics.interface`."""
     model = mujoco.MjModel.from_xml_path(str(XML))
     physics = Physics(model, (), options.substeps, engine)
     return CartpoleSwingup(

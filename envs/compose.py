@@ -14,8 +14,8 @@ from dm_control import mjcf
 
 from envs.arenas import GROUND, Arena, BoxFields, box_fields, build_arena, check_passable
 from envs.bodies import Body
-from purerl.model import find, unknown_name
-from purerl.physics import choose_engine
+from purerl.physics.interface import choose_engine
+from purerl.physics.lookup import find, unknown_name
 
 PREFIX = "walker/"  # composing puts it before the names of the body's parts
 TORSO_VELOCITY = "torso_velocity"  # a sensor of the walker's centre of mass [m/s]
@@ -55,7 +55,7 @@ def compose(
     Args:
       body: of `envs.bodies`.
       arena: of `envs.arenas`.
-      engine: as for `purerl.physics.Physics`; decides the solver's settings only.
+      engine: as for `purerl.physics.interface.Physics`; decides the solver's settings only.
       timestep: of physics [s]; the body's own if None.
       self_collision: whether parts of the body can touch each other.
       sensors: names of the body's sensors to keep.

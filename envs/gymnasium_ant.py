@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from purerl import model as lookup
-from purerl.env import State
-from purerl.physics import Physics, PhysicsState
-from purerl.types import Array
+from purerl.core.env import State
+from purerl.core.records import Array
+from purerl.physics import lookup
+from purerl.physics.interface import Physics, PhysicsState
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +102,7 @@ def load_model() -> mujoco.MjModel:
 
 
 def build(options: Options = Options(), engine: str = "auto") -> GymnasiumAnt:  # noqa: B008
-    """Builds the environment on an engine of `purerl.physics`."""
+    """Builds the environment on an engine of `purerl.physics.interface`."""
     model = load_model()
     root = tuple(lookup.qpos_indices(model, ["root"]).tolist())
     physics = Physics(model, ("cfrc_ext",), substeps=5, engine=engine)

@@ -24,10 +24,10 @@ from envs.arenas import (
 )
 from envs.bodies import ANT, RODENT, Body
 from envs.compose import Composed, compose
-from purerl import model as lookup
-from purerl.env import State
-from purerl.physics import Physics, PhysicsState, overflow_metric, overflow_reading
-from purerl.types import Array
+from purerl.core.env import State
+from purerl.core.records import Array
+from purerl.physics import lookup
+from purerl.physics.interface import Physics, PhysicsState, overflow_metric, overflow_reading
 
 BODIES = {"ant": ANT, "rodent": RODENT}
 READINGS = ("xpos", "xmat", "subtree_com", "actuator_force")
@@ -301,7 +301,7 @@ def build_arena(options: Options, body: Body) -> Arena:
 
 
 def build(options: Options = Options(), engine: str = "auto") -> Run:  # noqa: B008
-    """Builds the environment on an engine of `purerl.physics`."""
+    """Builds the environment on an engine of `purerl.physics.interface`."""
     body = BODIES[options.body]
     parts = compose(body, build_arena(options, body), engine)
     model = parts.model

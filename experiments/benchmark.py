@@ -30,14 +30,17 @@ import jax
 import jax.numpy as jnp
 
 from experiments import start_up
-from purerl import building, cli, kernels, learner, ppo, run
-from purerl.console import size
-from purerl.errors import leave, output_file
-from purerl.evaluation import evaluate
-from purerl.experiment import Experiment, find
-from purerl.model import scale_action
-from purerl.rollout import rollout
-from purerl.types import Array, Network, PyTree, TrainState
+from purerl import run
+from purerl.core.errors import leave, output_file
+from purerl.core.records import Array, Network, PyTree, TrainState
+from purerl.exact import xla_flags
+from purerl.physics.lookup import scale_action
+from purerl.ppo import algorithm, learner
+from purerl.ppo.evaluation import evaluate
+from purerl.ppo.rollout import rollout
+from purerl.runs import build_experiment, command_line
+from purerl.runs.console import size
+from purerl.runs.experiment import Experiment, find
 
 PARTS = ("physics alone", "rollout", "learner", "update", "evaluation")
 
@@ -70,7 +73,7 @@ class Timing(NamedTuple):
     busy: float | None = None  # share of the time in which a GPU ran a kernel
 
 
-def bare_physics(env: Any, config: ppo.Config, state: TrainState, key: Array) -> PyTree:
+def bare_physics(env: Any, config: algorithm.Config, state: TrainState, key: Array) -> PyTree:
     """Steps the engine alone for one rollout, from the environments' states [B]."""
     size = config.num_envs, env.action_size
 
@@ -94,18 +97,18 @@ def bare_physics(env: Any, config: ppo.Config, state: TrainState, key: Array) ->
 
 def make_bench(experiment: Experiment, names: Sequence[str] = PARTS) -> Bench:
     """Compiles the parts of an experiment on its engine."""
-    config, env, network, _ = building.build(experiment)
+    config, env, network, _ = build_experiment.build(experiment)
     key = jax.random.key(experiment.seed)
-    state = jax.jit(partial(ppo.init, config, env, network))(key)
+    state = jax.jit(partial(algorithm.init, config, env, network))(key)
     seen = None
     if "learner" in names:  # it needs something to learn from
-        state, seen = jax.jit(partial(ppo.collect, config, env, network))(state)
+        state, seen = jax.jit(partial(algorithm.collect, config, env, network))(state)
     steps, episodes = config.steps_per_update, experiment.evaluation.num_episodes
     programs: list[tuple[str, Callable, tuple, int | None]] = [
         ("physics alone", partial(bare_physics, env, config), (state, key), steps),
         ("rollout", partial(rollout, config, env, network), (state,), steps),
         ("learner", partial(learn, config, network), (state, seen), steps),
-        ("update", partial(ppo.update, config, env, network), (state,), steps),
+        ("update", partial(algorithm.update, config, env, network), (state,), steps),
         (
             "evaluation",
             partial(evaluate, config, env, network, num_episodes=episodes),
@@ -120,7 +123,7 @@ def make_bench(experiment: Experiment, names: Sequence[str] = PARTS) -> Bench:
 
 
 def learn(
-    config: ppo.Config, network: Network, state: TrainState, seen: ppo.Experience
+    config: algorithm.Config, network: Network, state: TrainState, seen: algorithm.Experience
 ) -> tuple[TrainState, PyTree]:
     """The learner alone, on one rollout's experience."""
     return learner.learn(config, network, state, seen.batch, seen.memory)
@@ -234,9 +237,11 @@ def main(arguments: list[str]) -> int:
     options, overrides = parser.parse_known_args(arguments)
     if options.start_up:
         return start_up.main([options.experiment, *overrides])
-    kernels.set_flags()  # as a run does, before JAX starts
+    xla_flags.set_flags()  # as a run does, before JAX starts
     prog = f"python -m experiments.benchmark {options.experiment}"
-    experiment, _ = run.from_command_line(cli.parse, find(options.experiment), overrides, prog)
+    experiment, _ = run.from_command_line(
+        command_line.parse, find(options.experiment), overrides, prog
+    )
     bench = make_bench(experiment, options.parts)
     timings = measure(bench.parts, options.rounds, options.least_s)
     held = memory(bench)

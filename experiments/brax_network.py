@@ -1,6 +1,6 @@
 """brax's network for PPO, with brax's initial weights, as a network of one's own.
 
-`purerl.networks.mlp` begins near mean 0, with one scale everywhere. brax's policy begins with
+`purerl.ppo.networks.mlp` begins near mean 0, with one scale everywhere. brax's policy begins with
 ordinary weights in its last layer, so that it acts otherwise in each state, and with scales around
 0.69: on brax's ant that came to more after 31 M steps (`docs/peers.md`).
 """
@@ -11,8 +11,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from purerl.networks import check_observation, from_linen
-from purerl.types import Array, Network, Normal, PolicyOutput
+from purerl.core.records import Array, Network, Normal, PolicyOutput
+from purerl.ppo.networks import check_observation, from_linen
 
 MIN_SCALE = 1e-3
 

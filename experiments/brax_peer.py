@@ -36,11 +36,13 @@ from envs import brax_env
 from experiments import brax_network
 from experiments.benchmark import Part, measure
 from experiments.peers import Ours
-from purerl import building, compilation, kernels
-from purerl.config import Config
-from purerl.errors import leave, output_file
-from purerl.experiment import Evaluation, Experiment
-from purerl.types import Array, PyTree
+from purerl.core.errors import leave, output_file
+from purerl.core.records import Array, PyTree
+from purerl.devices import compilation
+from purerl.exact import xla_flags
+from purerl.ppo.config import Config
+from purerl.runs import build_experiment
+from purerl.runs.experiment import Evaluation, Experiment
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,7 @@ def physics_alone(env: Any, num_steps: int, start: PyTree, key: Array) -> Array:
 
 def our_parts(chosen: Experiment) -> list[Part]:
     """Compiles the physics alone and our training, side by side, and makes the first update."""
-    config, env, network, _ = building.build(chosen)
+    config, env, network, _ = build_experiment.build(chosen)
     key = jax.random.key(chosen.seed)
     abstract = compilation.abstract_state(config, env, network).env.physics
     bare: Callable = partial(physics_alone, env, config.rollout_length)
@@ -269,7 +271,7 @@ def main(arguments: list[str]) -> int:
     if options.stretches < 3:
         parser.error(f"--stretches is {options.stretches}; two compile, so it takes at least 3.")
     if "purerl" in options.trainers:
-        kernels.set_flags()  # before JAX starts; it holds for all in this process
+        xla_flags.set_flags()  # before JAX starts; it holds for all in this process
     found: dict[str, list[dict]] = {}
     for body in options.bodies:
         sizes, rates = resize(BODIES[body], options.num_envs), []

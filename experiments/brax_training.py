@@ -29,10 +29,13 @@ import jax
 import numpy as np
 
 from experiments.brax_peer import BODIES, Published, our_experiment, resize, train_brax
-from purerl import building, compilation, kernels, statistics
-from purerl.compilation import Programs
-from purerl.errors import UserError, leave, output_file
-from purerl.experiment import Evaluation
+from purerl.core.errors import UserError, leave, output_file
+from purerl.devices import compilation
+from purerl.devices.compilation import Programs
+from purerl.exact import xla_flags
+from purerl.report import bootstrap
+from purerl.runs import build_experiment
+from purerl.runs.experiment import Evaluation
 
 NUM_EPISODES = 128
 PHYSICS = {"purerl": "purerl", "purerl-on-brax": "mjx"}  # ours -> whose
@@ -95,14 +98,14 @@ def run_brax(task: Task, seed: int) -> Run:
 def our_programs(task: Task, physics: str) -> Programs:
     """Compiles our training, once in a process."""
     chosen = our_experiment(task.body, physics, task.sizes, task.steps)
-    config, env, network, _ = building.build(chosen)
+    config, env, network, _ = build_experiment.build(chosen)
     evaluation = Evaluation(num_episodes=NUM_EPISODES)
     return compilation.compile_programs(config, env, network, evaluation, fresh=True)
 
 
 def run_ours(task: Task, trainer: str, seed: int) -> Run:
-    """Trains with our programs, called as `purerl.train` calls them."""
-    for name in ("brax.envs", "purerl.engine_jax"):
+    """Trains with our programs, called as `purerl.runs.loop` calls them."""
+    for name in ("brax.envs", "purerl.physics.engine_mjx"):
         importlib.import_module(name)
     begin = time.perf_counter()
     run = Run(trainer, task.body, seed, False, [], [], [], [])
@@ -180,7 +183,7 @@ def table(runs: list[Run]) -> str:
         if not own:
             continue
         cold = ", ".join(f"{run.seconds[-1]:.1f}" for run in own if run.cold) or "not measured"
-        iqm = float(statistics.interquartile_mean(values))
+        iqm = float(bootstrap.interquartile_mean(values))
         other = final["brax"] if trainer != "brax" else np.array([])
         cells = (trainer, cold, f"{steady(own):,.0f}", str(len(own)), f"{iqm:.0f}")
         lines.append(f"| {' | '.join((*cells, difference(values, other)))} |")
@@ -191,8 +194,8 @@ def difference(values: np.ndarray, others: np.ndarray) -> str:
     """Formats IQM(values) - IQM(others) with its interval, where there are runs enough for one."""
     if not others.size:
         return ""
-    both = statistics.interquartile_mean(values) - statistics.interquartile_mean(others)
-    interval = statistics.difference_interval([values], [others])
+    both = bootstrap.interquartile_mean(values) - bootstrap.interquartile_mean(others)
+    interval = bootstrap.difference_interval([values], [others])
     bounds = f" [{interval.low:.0f}, {interval.high:.0f}]" if interval else ", too few seeds"
     return f"{both:.0f}{bounds}"
 
@@ -236,7 +239,7 @@ def main(arguments: list[str]) -> int:
             print(f"{body}\n\n{table([run for run in runs if run.body == body])}\n")
         return 0
     if options.what != "brax":
-        kernels.set_flags()  # before JAX starts
+        xla_flags.set_flags()  # before JAX starts
     with tempfile.TemporaryDirectory() as folder:
         options.cache = options.cache or folder
         Path(options.cache).mkdir(parents=True, exist_ok=True)

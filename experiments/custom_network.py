@@ -12,10 +12,10 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 from envs import cartpole_swingup
-from purerl.config import Config
-from purerl.experiment import Experiment
-from purerl.networks import from_linen
-from purerl.types import Array, Network, Normal, PolicyOutput
+from purerl.core.records import Array, Network, Normal, PolicyOutput
+from purerl.ppo.config import Config
+from purerl.ppo.networks import from_linen
+from purerl.runs.experiment import Experiment
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,11 +16,12 @@ import jax
 from envs.suite.tasks import TASKS
 from envs.suite.tasks import Options as SuiteOptions
 from experiments.benchmark import bare_physics, compile_part, measure
-from purerl import building, ppo
-from purerl.env import check_env
-from purerl.errors import UserError, leave, one_line
-from purerl.experiment import Experiment, find
-from purerl.rollout import rollout
+from purerl.core.env import check_env
+from purerl.core.errors import UserError, leave, one_line
+from purerl.ppo import algorithm
+from purerl.ppo.rollout import rollout
+from purerl.runs import build_experiment
+from purerl.runs.experiment import Experiment, find
 
 OURS = ("cartpole_swingup", "ant_run", "ant_gaps", "rodent_run", "rodent_gaps")
 ROW = "| {:24} | {:6} | {:8} | {:>13} | {:>9} | {:>5} |"
@@ -45,10 +46,10 @@ def sized(experiment: Experiment, engine: str, num_envs: int, length: int) -> Ex
 
 def row(name: str, experiment: Experiment, engine: str, rounds: int) -> str:
     """Checks and times one environment on one engine."""
-    config, env, network, _ = building.build(experiment)
+    config, env, network, _ = build_experiment.build(experiment)
     check_env(env, num_envs=2, num_steps=2)
     key = jax.random.key(experiment.seed)
-    state = jax.jit(partial(ppo.init, config, env, network))(key)
+    state = jax.jit(partial(algorithm.init, config, env, network))(key)
     steps = config.steps_per_update
     parts = [
         compile_part("physics", partial(bare_physics, env, config), (state, key), steps),

@@ -15,15 +15,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from purerl import building, rundir
-from purerl.compilation import set_up_jax
-from purerl.errors import UserError, leave
-from purerl.evaluation import evaluate
-from purerl.keys import Purpose, derive
-from purerl.types import Array, Network, Normal, PolicyOutput, TrainState
+from purerl.core.errors import UserError, leave
+from purerl.core.keys import Purpose, derive
+from purerl.core.records import Array, Network, Normal, PolicyOutput, TrainState
+from purerl.devices.compilation import set_up_jax
+from purerl.ppo.evaluation import evaluate
+from purerl.runs import build_experiment, run_folder
 
 
-def gaps_of(setup: building.Setup, state: TrainState, seed: int, episodes: int) -> dict[str, Any]:
+def gaps_of(
+    setup: build_experiment.Setup, state: TrainState, seed: int, episodes: int
+) -> dict[str, Any]:
     """Evaluates deterministically in `episodes` corridors; the same seed gives the same ones."""
 
     def judge(state: TrainState, key: Array) -> dict[str, Array]:
@@ -86,13 +88,13 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--engine", default="", help="where it should not be the run's own")
     options = parser.parse_args(arguments)
     set_up_jax(cache=True)
-    trained = rundir.restore(options.run, "latest", print, options.engine)
+    trained = run_folder.restore(options.run, "latest", print, options.engine)
     setup, state = trained.setup, trained.saved.state
     if "gaps_crossed_count" not in jax.eval_shape(setup.env.reset, jax.random.key(0)).metrics:
         raise UserError(f"{options.run} runs where there are no gaps; give a run in a corridor.")
     policies = {"trained": (setup, state)}
     if options.floor_run:
-        floor = rundir.restore(options.floor_run, "latest", print, options.engine)
+        floor = run_folder.restore(options.floor_run, "latest", print, options.engine)
         size = count_features(floor.saved.state)
         extra = count_features(state) - size
         network = blind(floor.setup.network, size)

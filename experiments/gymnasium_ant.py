@@ -5,9 +5,9 @@ python -m purerl.run gymnasium_ant
 """
 
 from envs import gymnasium_ant
-from purerl import networks
-from purerl.config import Config
-from purerl.experiment import Evaluation, Experiment
+from purerl.ppo import networks
+from purerl.ppo.config import Config
+from purerl.runs.experiment import Evaluation, Experiment
 
 experiment = Experiment(
     build_env=gymnasium_ant.build,

@@ -30,10 +30,11 @@ import jax
 
 from experiments.benchmark import Part, Timing, measure
 from experiments.gymnasium_ant import experiment
-from purerl import building, ppo
-from purerl.config import Config
-from purerl.errors import leave, output_file
-from purerl.networks import MlpOptions
+from purerl.core.errors import leave, output_file
+from purerl.ppo import algorithm
+from purerl.ppo.config import Config
+from purerl.ppo.networks import MlpOptions
+from purerl.runs import build_experiment
 
 
 class Sizes(NamedTuple):
@@ -84,9 +85,9 @@ def our_network(sizes: Sizes) -> MlpOptions:
 def ours(sizes: Sizes) -> Part:
     """Compiles purerl's training and makes its first update."""
     chosen = replace(experiment, ppo=our_config(sizes), network=our_network(sizes))
-    config, env, network, engine = building.build(chosen)
-    state = jax.jit(partial(ppo.init, config, env, network))(jax.random.key(chosen.seed))
-    update = jax.jit(partial(ppo.update, config, env, network), donate_argnums=0)
+    config, env, network, engine = build_experiment.build(chosen)
+    state = jax.jit(partial(algorithm.init, config, env, network))(jax.random.key(chosen.seed))
+    update = jax.jit(partial(algorithm.update, config, env, network), donate_argnums=0)
     trainer = Ours(update, state)
     trainer()
     name = f"purerl, engine {engine}, {config.num_envs} environments"

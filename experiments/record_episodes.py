@@ -34,13 +34,13 @@ import flax.linen as nn
 import jax
 import numpy as np
 
-from purerl import building, rundir, snapshot
-from purerl.compilation import set_up_jax
-from purerl.errors import UserError, leave, output_file
-from purerl.evaluation import Progress, advance, start
-from purerl.keys import Purpose, derive
-from purerl.rollout import act
-from purerl.types import Array, TrainState
+from purerl.core.errors import UserError, leave, output_file
+from purerl.core.keys import Purpose, derive
+from purerl.core.records import Array, TrainState
+from purerl.devices.compilation import set_up_jax
+from purerl.ppo.evaluation import Progress, advance, start
+from purerl.ppo.rollout import act
+from purerl.runs import build_experiment, run_folder, state_arrays
 
 
 def note_modules(noted: dict[str, Array]) -> Callable[..., Any]:
@@ -61,7 +61,9 @@ def note_modules(noted: dict[str, Array]) -> Callable[..., Any]:
     return intercept
 
 
-def play(setup: building.Setup, state: TrainState, key: Array, number: int) -> dict[str, Any]:
+def play(
+    setup: build_experiment.Setup, state: TrainState, key: Array, number: int
+) -> dict[str, Any]:
     """Plays N whole episodes by the deterministic policy; pure. Returns arrays [T, N, ...]."""
     config, env, network, _ = setup
     reset_key, _ = jax.random.split(key)  # as `evaluation.evaluate` does: the same beginnings
@@ -89,11 +91,15 @@ def play(setup: building.Setup, state: TrainState, key: Array, number: int) -> d
     return jax.lax.scan(step, start(config, env, state, reset_key, number), length=steps)[1]
 
 
-def record(setup: building.Setup, state: TrainState, seed: int, number: int) -> snapshot.Leaves:
+def record(
+    setup: build_experiment.Setup, state: TrainState, seed: int, number: int
+) -> state_arrays.Leaves:
     """Returns the arrays of N episodes by name, [N, T, ...], and their `length` [N]."""
     key = derive(jax.random.key(seed), Purpose.EVALUATION)
     rows = jax.jit(lambda state, key: play(setup, state, key, number))(state, key)
-    arrays = {name: np.swapaxes(x, 0, 1) for name, x in snapshot.flatten(rows).items() if x.size}
+    arrays = {
+        name: np.swapaxes(x, 0, 1) for name, x in state_arrays.flatten(rows).items() if x.size
+    }
     length = arrays.pop("running").sum(axis=1)
     return {"length": length} | {name: x[:, : length.max()] for name, x in arrays.items()}
 
@@ -113,7 +119,7 @@ def main(arguments: list[str]) -> int:
     if options.episodes < 1:
         raise UserError(f"episodes is {options.episodes}; it must be at least 1.")
     set_up_jax(cache=True)
-    run = rundir.restore(options.run, options.checkpoint, print, options.engine)
+    run = run_folder.restore(options.run, options.checkpoint, print, options.engine)
     arrays = record(run.setup, run.saved.state, options.seed, options.episodes)
     with Path(options.out).open("wb") as file:  # by its name, numpy would give it another
         np.savez(file, **arrays)

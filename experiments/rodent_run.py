@@ -8,9 +8,9 @@ beside it.
 """
 
 from envs import run
-from purerl import networks
-from purerl.config import Config
-from purerl.experiment import Evaluation, Experiment
+from purerl.ppo import networks
+from purerl.ppo.config import Config
+from purerl.runs.experiment import Evaluation, Experiment
 
 experiment = Experiment(
     build_env=run.build,

@@ -26,9 +26,12 @@ from typing import Any, NamedTuple
 import jax
 
 from experiments.benchmark import compile_part, measure
-from purerl import building, cli, kernels, ppo, run
-from purerl.errors import UserError, leave, output_file
-from purerl.experiment import Experiment, find
+from purerl import run
+from purerl.core.errors import UserError, leave, output_file
+from purerl.exact import xla_flags
+from purerl.ppo import algorithm
+from purerl.runs import build_experiment, command_line
+from purerl.runs.experiment import Experiment, find
 
 HERE = sorted(os.sched_getaffinity(0))  # cores that this process may use
 AXES: dict[str, tuple[int, ...]] = {
@@ -48,11 +51,11 @@ class Sweep(NamedTuple):
 
     name: str  # of the experiment
     words: list[str]  # its overrides, as on the command line
-    config: ppo.Config  # with them
+    config: algorithm.Config  # with them
     minibatch: int  # samples, at most
 
 
-def overrides(axis: str, value: int, config: ppo.Config, minibatch: int) -> list[str]:
+def overrides(axis: str, value: int, config: algorithm.Config, minibatch: int) -> list[str]:
     """Returns the options that put one axis at a value."""
     envs = value if axis == "envs" else config.num_envs
     length = {"envs": SHORT, "length": value}.get(axis, config.rollout_length)
@@ -107,10 +110,10 @@ def run_on(cores: int, command: list[str]) -> int:
 def seeds_point(experiment: Experiment, engine: str, number: int) -> dict[str, Any]:
     """Measures the update of vmapped seeds."""
     chosen = dataclasses.replace(experiment, engine=engine)
-    config, env, network, _ = building.build(chosen)
+    config, env, network, _ = build_experiment.build(chosen)
     keys = jax.random.split(jax.random.key(chosen.seed), number)
-    state = jax.jit(jax.vmap(partial(ppo.init, config, env, network)))(keys)
-    update = jax.vmap(partial(ppo.update, config, env, network))
+    state = jax.jit(jax.vmap(partial(algorithm.init, config, env, network)))(keys)
+    update = jax.vmap(partial(algorithm.update, config, env, network))
     part = compile_part("update", update, (state,), number * config.steps_per_update)
     rate = measure([part], 3, 0.5)[0].steps_per_second
     return {"axis": "seeds", "value": number, "steps_per_s": round(rate),
@@ -151,9 +154,9 @@ def main(arguments: list[str]) -> int:
         parser.error(f"--minibatch is {options.minibatch}; it must be at least 1.")
     seeds = find(options.seeds_experiment).experiment
     prog = "python -m experiments.scaling"
-    experiment, _ = run.from_command_line(cli.parse, find(options.experiment), words, prog)
+    experiment, _ = run.from_command_line(command_line.parse, find(options.experiment), words, prog)
     sweep = Sweep(options.experiment, words, experiment.ppo, options.minibatch)
-    kernels.set_flags()  # for seeds, in this process
+    xla_flags.set_flags()  # for seeds, in this process
     rows = []
     for axis, value in [(name, value) for name in options.axes for value in AXES[name]]:
         if axis == "seeds":

@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from purerl.errors import UserError, leave
+from purerl.core.errors import UserError, leave
 
 LIMIT_S = 900.0
 

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from purerl.errors import FAILURE, UserError, leave, tell
+from purerl.core.errors import FAILURE, UserError, leave, tell
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    from purerl.cli import parse
+    from purerl.runs.command_line import parse
 
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
@@ -62,28 +62,28 @@ def compare_runs(options: Options) -> tuple[dict[str, Any], list[Any]]:
     Raises:
       UserError: an argument means no run, or there is no such metric or setting.
     """
-    from purerl import groups, history, twins
+    from purerl.report import bit_diff, run_reader, seed_statistics
 
     if not options.runs:
         raise UserError("Give the runs to compare: python -m purerl.compare RUN RUN ...")
-    runs = [history.read(path) for path in history.find_runs(options.runs)]
-    pairs = [twins.compare(a, b) for a, b in twins.twins(runs)]
-    found = groups.make_groups(runs, options.group_by)
+    runs = [run_reader.read(path) for path in run_reader.find_runs(options.runs)]
+    pairs = [bit_diff.compare(a, b) for a, b in bit_diff.twins(runs)]
+    found = seed_statistics.make_groups(runs, options.group_by)
     summaries, unscored = [], ""
     try:
-        history.check_metric(runs, options.metric)
-        summaries = [groups.summarize(group, options.metric) for group in found]
-        groups.check_scored(summaries, options.metric)
+        run_reader.check_metric(runs, options.metric)
+        summaries = [seed_statistics.summarize(group, options.metric) for group in found]
+        seed_statistics.check_scored(summaries, options.metric)
     except UserError as error:
         if not pairs:
             raise
         found, summaries, unscored = [], [], str(error)  # whether bits are equal can still be told
-    against = [groups.versus(group, found[0], options.metric) for group in found[1:]]
-    curves = [groups.learning_curve(group, options.metric) for group in found]
+    against = [seed_statistics.versus(group, found[0], options.metric) for group in found[1:]]
+    curves = [seed_statistics.learning_curve(group, options.metric) for group in found]
     result = {
         "metric": options.metric,
         "runs": len(runs),
-        "settings_that_differ": groups.differing(runs),
+        "settings_that_differ": seed_statistics.differing(runs),
         "conditions_that_differ": conditions(runs),
         "pairs": [pair._asdict() for pair in pairs],
         "unscored": unscored,
@@ -100,7 +100,7 @@ def as_json(record: Any) -> dict[str, Any]:
 
 def conditions(runs: Sequence[Any]) -> list[str]:
     """Lists in what the machines and versions of the runs differ from the first one's."""
-    from purerl import manifest
+    from purerl.runs import manifest
 
     found = [manifest.differences(runs[0].manifest, run.manifest) for run in runs[1:]]
     return list(dict.fromkeys(line for lines in found for line in lines))
@@ -160,7 +160,7 @@ def versus_rows(against: Iterable[dict[str, Any]]) -> list[list[str]]:
 
 def notes(summaries: Sequence[dict[str, Any]]) -> list[str]:
     """Returns what a reader of the tables must know."""
-    from purerl.statistics import LEAST_RUNS
+    from purerl.report.bootstrap import LEAST_RUNS
 
     lines = []
     if any(s["interval"] is None for s in summaries):

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from purerl.errors import UserError, leave, tell
+from purerl.core.errors import UserError, leave, tell
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    from purerl.cli import parse
+    from purerl.runs.command_line import parse
 
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
@@ -53,10 +53,10 @@ def evaluate_run(options: Options) -> dict[str, Any]:
     import jax
     import numpy as np
 
-    from purerl.compilation import set_up_jax
-    from purerl.evaluation import evaluate
-    from purerl.keys import Purpose, derive
-    from purerl.rundir import restore
+    from purerl.core.keys import Purpose, derive
+    from purerl.devices.compilation import set_up_jax
+    from purerl.ppo.evaluation import evaluate
+    from purerl.runs.run_folder import restore
 
     if options.episodes < 1:
         raise UserError(f"episodes is {options.episodes}; it must be at least 1.")

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from purerl.errors import RunError, UserError, leave, one_line, tell
+from purerl.core.errors import RunError, UserError, leave, one_line, tell
 
 SHEET = 4  # rows and columns of the contact sheet
 SHEET_WIDTH = 320  # of each of its images [pixels]
@@ -44,7 +44,7 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    from purerl.cli import parse
+    from purerl.runs.command_line import parse
 
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
@@ -66,14 +66,14 @@ def render_run(options: Options) -> Path:
     for name, least in (("episodes", 1), ("seconds", 0.1)):
         if not getattr(options, name) >= least:
             raise UserError(f"{name} is {getattr(options, name)}; it must be at least {least}.")
-    from purerl.scene import Renderer, open_gl
+    from purerl.report.renderer import Renderer, open_gl
 
     # First of all: an experiment imports mujoco and dm_control, which look for OpenGL themselves.
     open_gl(width, height).free()
 
-    from purerl.compilation import set_up_jax
-    from purerl.rundir import restore
-    from purerl.video import episode_pictures, frame_stride, physics_of
+    from purerl.devices.compilation import set_up_jax
+    from purerl.report.episode_pictures import episode_pictures, frame_stride, physics_of
+    from purerl.runs.run_folder import restore
 
     set_up_jax(cache=True)
     run = restore(options.run, options.checkpoint, print, options.engine)
@@ -115,8 +115,8 @@ def play(run: Any, options: Options) -> Any:
 
     import jax
 
-    from purerl.keys import Purpose, derive
-    from purerl.video import record
+    from purerl.core.keys import Purpose, derive
+    from purerl.report.episode_pictures import record
 
     config, env, network, _ = run.setup
     steps = max(1, round(min(options.seconds / env.control_timestep, config.episode_length)))

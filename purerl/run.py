@@ -23,9 +23,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from purerl import experiment, kernels
-from purerl.errors import USAGE, RunError, StoppedError, UserError, leave, tell
-from purerl.experiment import Experiment, Source
+from purerl.core.errors import USAGE, RunError, StoppedError, UserError, leave, tell
+from purerl.exact import xla_flags
+from purerl.runs import experiment
+from purerl.runs.experiment import Experiment, Source
 
 
 @dataclass(frozen=True)
@@ -112,10 +113,10 @@ def resume_command(arguments: Sequence[str]) -> str:
 
 def command(arguments: Sequence[str]) -> None:
     """Parses, prepares and trains."""
-    kernels.set_flags()  # before JAX starts
-    from purerl.cli import parse
-    from purerl.distributed import fail_together
-    from purerl.launch import execute
+    xla_flags.set_flags()  # before JAX starts
+    from purerl.devices.processes import fail_together
+    from purerl.runs.command_line import parse
+    from purerl.runs.session import execute
 
     if arguments[0].startswith("-"):
         raise UserError(

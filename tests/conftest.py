@@ -17,7 +17,7 @@ import jax  # noqa: E402
 jax.config.update("jax_debug_key_reuse", True)  # a key consumed twice raises
 
 # Files that take a minute or more, the longest first: begun last, one would run alone at the end.
-LONGEST = ("shards", "run", "physics", "seeds", "ppo", "suite", "probes", "kill", "envs")
+LONGEST = ("shards", "run", "interface", "seeds", "algorithm", "suite", "probes", "kill", "envs")
 
 
 def pytest_collection_modifyitems(items):

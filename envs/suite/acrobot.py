@@ -9,8 +9,8 @@ from dm_control.suite import acrobot
 
 from envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, make_env
 from envs.suite.rewards import tolerance
-from purerl import model as lookup
-from purerl.types import Array
+from purerl.core.records import Array
+from purerl.physics import lookup
 
 MARGINS = {"swingup": 1.0, "swingup_sparse": 0.0}  # of the tip's distance to the target [m]
 READINGS = ("xmat", "site_xpos")
@@ -52,7 +52,7 @@ class Acrobot:
 
 
 def build(options: Options = Options(), engine: str = "auto") -> SuiteEnv:  # noqa: B008
-    """Builds the environment on an engine of `purerl.physics`."""
+    """Builds the environment on an engine of `purerl.physics.interface`."""
     check_task(options.task, tuple(MARGINS))
     model = load_model(acrobot.Physics, acrobot.get_model_and_assets(), engine)
     target = lookup.find(model, "site", "target")

@@ -15,9 +15,9 @@ from envs.suite.base import (
     make_env,
     touching_pairs,
 )
-from purerl import model as lookup
-from purerl.physics import Physics
-from purerl.types import Array
+from purerl.core.records import Array
+from purerl.physics import lookup
+from purerl.physics.interface import Physics
 
 CANDIDATES = 8  # starting places to draw, to have one in which the ball touches nothing
 READINGS = ("xpos", "site_xpos")
@@ -63,7 +63,7 @@ class BallInCup:
 
 
 def build(options: Options = Options(), engine: str = "auto") -> SuiteEnv:  # noqa: B008
-    """Builds the environment on an engine of `purerl.physics`."""
+    """Builds the environment on an engine of `purerl.physics.interface`."""
     model = load_model(ball_in_cup.Physics, ball_in_cup.get_model_and_assets(), engine)
     target = lookup.find(model, "site", "target")
     size = model.site_size[target, [0, 2]] - model.geom_size[lookup.find(model, "geom", "ball"), 0]

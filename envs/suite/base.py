@@ -9,16 +9,16 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from purerl import model as lookup
-from purerl.env import State
-from purerl.physics import (
+from purerl.core.env import State
+from purerl.core.records import Array
+from purerl.physics import lookup
+from purerl.physics.interface import (
     Physics,
     PhysicsState,
     choose_engine,
     overflow_metric,
     overflow_reading,
 )
-from purerl.types import Array
 
 _JOINT = mujoco.mjtJoint
 _GEOM = mujoco.mjtGeom

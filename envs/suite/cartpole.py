@@ -9,8 +9,8 @@ from dm_control.suite import cartpole
 
 from envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, make_env
 from envs.suite.rewards import tolerance
-from purerl import model as lookup
-from purerl.types import Array
+from purerl.core.records import Array
+from purerl.physics import lookup
 
 TASKS = ("balance", "swingup")
 READINGS = ("xmat",)
@@ -60,7 +60,7 @@ class Cartpole:
 
 
 def build(options: Options = Options(), engine: str = "auto") -> SuiteEnv:  # noqa: B008
-    """Builds the environment on an engine of `purerl.physics`."""
+    """Builds the environment on an engine of `purerl.physics.interface`."""
     check_task(options.task, TASKS)
     model = load_model(cartpole.Physics, cartpole.get_model_and_assets(), engine)
     domain = Cartpole(

@@ -9,9 +9,9 @@ from dm_control.suite import cheetah
 
 from envs.suite.base import Moment, Start, SuiteEnv, load_model, make_env
 from envs.suite.rewards import tolerance
-from purerl import model as lookup
-from purerl.physics import Physics
-from purerl.types import Array
+from purerl.core.records import Array
+from purerl.physics import lookup
+from purerl.physics.interface import Physics
 
 RUN_SPEED = 10.0  # [m/s]
 SETTLING = 200  # physics steps from the random pose to the start of the episode
@@ -53,7 +53,7 @@ class Cheetah:
 
 
 def build(options: Options = Options(), engine: str = "auto") -> SuiteEnv:  # noqa: B008
-    """Builds the environment on an engine of `purerl.physics`."""
+    """Builds the environment on an engine of `purerl.physics.interface`."""
     model = load_model(cheetah.Physics, cheetah.get_model_and_assets(), engine)
     domain = Cheetah(
         settling=Physics(model, (), SETTLING, engine),

@@ -16,9 +16,9 @@ from envs.suite.base import (
     random_joints,
     touching_pairs,
 )
-from purerl import model as lookup
-from purerl.physics import Physics
-from purerl.types import Array
+from purerl.core.records import Array
+from purerl.physics import lookup
+from purerl.physics.interface import Physics
 
 SPIN = 15.0  # [rad/s], in the negative direction
 SPINNER_DAMPING = 0.03  # dm_control lowers the hinge's for this task [N m s/rad]
@@ -65,7 +65,7 @@ class Finger:
 
 
 def build(options: Options = Options(), engine: str = "auto") -> SuiteEnv:  # noqa: B008
-    """Builds the environment on an engine of `purerl.physics`."""
+    """Builds the environment on an engine of `purerl.physics.interface`."""
     model = load_model(finger.Physics, finger.get_model_and_assets(), engine)
     model.dof_damping[lookup.qvel_indices(model, ["hinge"])] = SPINNER_DAMPING
     domain = Finger(

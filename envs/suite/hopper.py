@@ -9,8 +9,8 @@ from dm_control.suite import hopper
 
 from envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, make_env, random_joints
 from envs.suite.rewards import tolerance
-from purerl import model as lookup
-from purerl.types import Array
+from purerl.core.records import Array
+from purerl.physics import lookup
 
 TASKS = ("stand", "hop")
 STAND_HEIGHT = 0.6  # torso above foot [m]
@@ -63,7 +63,7 @@ class Hopper:
 
 
 def build(options: Options = Options(), engine: str = "auto") -> SuiteEnv:  # noqa: B008
-    """Builds the environment on an engine of `purerl.physics`."""
+    """Builds the environment on an engine of `purerl.physics.interface`."""
     check_task(options.task, TASKS)
     model = load_model(hopper.Physics, hopper.get_model_and_assets(), engine)
     touch = tuple(lookup.sensor_slice(model, f"touch_{part}").start for part in ("toe", "heel"))

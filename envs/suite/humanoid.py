@@ -19,9 +19,9 @@ from envs.suite.base import (
     touching_pairs,
 )
 from envs.suite.rewards import tolerance
-from purerl import model as lookup
-from purerl.physics import Physics
-from purerl.types import Array
+from purerl.core.records import Array
+from purerl.physics import lookup
+from purerl.physics.interface import Physics
 
 SPEEDS = {"stand": 0.0, "walk": 1.0, "run": 10.0}  # [m/s]
 STAND_HEIGHT = 1.4  # of the head [m]
@@ -83,7 +83,7 @@ class Humanoid:
 
 
 def build(options: Options = Options(), engine: str = "auto") -> SuiteEnv:  # noqa: B008
-    """Builds the environment on an engine of `purerl.physics`."""
+    """Builds the environment on an engine of `purerl.physics.interface`."""
     check_task(options.task, tuple(SPEEDS))
     model = load_model(humanoid.Physics, humanoid.get_model_and_assets(), engine)
     domain = Humanoid(

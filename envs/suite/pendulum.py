@@ -9,8 +9,8 @@ from dm_control.suite import pendulum
 
 from envs.suite.base import Moment, Start, SuiteEnv, load_model, make_env
 from envs.suite.rewards import tolerance
-from purerl import model as lookup
-from purerl.types import Array
+from purerl.core.records import Array
+from purerl.physics import lookup
 
 READINGS = ("xmat",)
 UPRIGHT = float(np.cos(np.deg2rad(8)))  # cosine of the angle within which it is up
@@ -44,6 +44,6 @@ class Pendulum:
 
 
 def build(options: Options = Options(), engine: str = "auto") -> SuiteEnv:  # noqa: B008
-    """Builds the environment on an engine of `purerl.physics`."""
+    """Builds the environment on an engine of `purerl.physics.interface`."""
     model = load_model(pendulum.Physics, pendulum.get_model_and_assets(), engine)
     return make_env(Pendulum(lookup.find(model, "body", "pole")), model, READINGS, 0.02, engine)

@@ -13,8 +13,8 @@ from dm_control.suite import reacher
 
 from envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, make_env, random_joints
 from envs.suite.rewards import tolerance
-from purerl import model as lookup
-from purerl.types import Array
+from purerl.core.records import Array
+from purerl.physics import lookup
 
 TARGET_SIZES = {"easy": 0.05, "hard": 0.015}  # radius [m]
 READINGS = ("geom_xpos",)
@@ -61,7 +61,7 @@ class Reacher:
 
 
 def build(options: Options = Options(), engine: str = "auto") -> SuiteEnv:  # noqa: B008
-    """Builds the environment on an engine of `purerl.physics`."""
+    """Builds the environment on an engine of `purerl.physics.interface`."""
     check_task(options.task, tuple(TARGET_SIZES))
     model = load_model(reacher.Physics, reacher.get_model_and_assets(), engine)
     target, finger = (lookup.find(model, "geom", name) for name in ("target", "finger"))

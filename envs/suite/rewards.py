@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from purerl.types import Array
+from purerl.core.records import Array
 
 SIGMOIDS = ("gaussian", "hyperbolic", "linear", "long_tail", "quadratic")
 

@@ -9,8 +9,8 @@ from dm_control.suite import swimmer
 
 from envs.suite.base import Moment, Start, SuiteEnv, load_model, make_env, random_joints
 from envs.suite.rewards import tolerance
-from purerl import model as lookup
-from purerl.types import Array
+from purerl.core.records import Array
+from purerl.physics import lookup
 
 NEAR, FAR, NEAR_CHANCE = 0.3, 2.0, 0.2  # half-width of the target's square [m], and its chance
 READINGS = ("geom_xpos", "xmat", "sensordata")
@@ -60,7 +60,7 @@ class Swimmer:
 
 
 def build(options: Options = Options(), engine: str = "auto") -> SuiteEnv:  # noqa: B008
-    """Builds the environment on an engine of `purerl.physics`."""
+    """Builds the environment on an engine of `purerl.physics.interface`."""
     xml = swimmer.get_model_and_assets(options.links)
     model = load_model(swimmer.Physics, xml, engine)
     domain = Swimmer(

@@ -54,6 +54,6 @@ class Options:
 
 
 def build(options: Options = Options(), engine: str = "auto") -> SuiteEnv:  # noqa: B008
-    """Builds the task's environment on an engine of `purerl.physics`."""
+    """Builds the task's environment on an engine of `purerl.physics.interface`."""
     module, settings = TASKS[options.task]
     return module.build(settings, engine)

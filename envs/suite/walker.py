@@ -9,8 +9,8 @@ from dm_control.suite import walker
 
 from envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, make_env, random_joints
 from envs.suite.rewards import tolerance
-from purerl import model as lookup
-from purerl.types import Array
+from purerl.core.records import Array
+from purerl.physics import lookup
 
 SPEEDS = {"stand": 0.0, "walk": 1.0, "run": 8.0}  # [m/s]
 STAND_HEIGHT = 1.2  # of the torso [m]
@@ -58,7 +58,7 @@ class Walker:
 
 
 def build(options: Options = Options(), engine: str = "auto") -> SuiteEnv:  # noqa: B008
-    """Builds the environment on an engine of `purerl.physics`."""
+    """Builds the environment on an engine of `purerl.physics.interface`."""
     check_task(options.task, tuple(SPEEDS))
     model = load_model(walker.Physics, walker.get_model_and_assets(), engine)
     domain = Walker(

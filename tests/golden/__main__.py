@@ -52,15 +52,15 @@ def of_run(experiment: Path, options: str, runs: Path) -> dict[str, str]:
 
 def of_statistics() -> dict[str, str]:
     """Computes what `compare` says of scores."""
-    from purerl import statistics
+    from purerl.report import bootstrap
 
     x = [np.sin(np.arange(12.0)), np.cos(np.arange(7.0))]
     y = [np.sin(np.arange(3.0, 15.0)), np.cos(np.arange(2.0, 9.0))]
     found = {
-        "interval": statistics.iqm_interval(x),
-        "difference": statistics.difference_interval(x, y),
-        "improvement": statistics.improvement_interval(x, y),
-        "band": [list(map(float, row)) for row in statistics.curve_band([np.outer(x[0], y[0])])],
+        "interval": bootstrap.iqm_interval(x),
+        "difference": bootstrap.difference_interval(x, y),
+        "improvement": bootstrap.improvement_interval(x, y),
+        "band": [list(map(float, row)) for row in bootstrap.curve_band([np.outer(x[0], y[0])])],
     }
     return {"intervals": sha256(json.dumps(found))}
 

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 
 from envs import cartpole_swingup
-from purerl import networks
-from purerl.config import Config
-from purerl.env import State
-from purerl.experiment import Evaluation, Experiment
-from purerl.types import Array
+from purerl.core.env import State
+from purerl.core.records import Array
+from purerl.ppo import networks
+from purerl.ppo.config import Config
+from purerl.runs.experiment import Evaluation, Experiment
 
 
 @dataclass(frozen=True)

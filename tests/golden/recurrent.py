@@ -1,9 +1,9 @@
 """A cart-pole and a network with memory."""
 
 from envs import cartpole_swingup
-from purerl import networks
-from purerl.config import Config
-from purerl.experiment import Evaluation, Experiment
+from purerl.ppo import networks
+from purerl.ppo.config import Config
+from purerl.runs.experiment import Evaluation, Experiment
 
 experiment = Experiment(
     build_env=cartpole_swingup.build,

@@ -1,0 +1,37 @@
+"""Random keys, derived by use: `fold_in` from (seed, purpose, indices), never split in sequence.
+
+A key depends only on what it is for, so no result depends on how often something else was drawn,
+on where a checkpoint was taken, or on how environments are spread over devices.
+"""
+
+import enum
+
+import jax
+import jax.numpy as jnp
+
+from purerl.core.records import Array
+
+
+class Purpose(enum.IntEnum):
+    """What a key is for. Numbers are part of a run's identity: never reuse or renumber one."""
+
+    PARAMETERS = 0
+    FIRST_RESET = 1
+    FIRST_LIMIT = 2
+    RESET = 3
+    ACTION = 4
+    PERMUTATION = 5
+    EVALUATION = 6
+    VIDEO = 7
+
+
+def derive(key: Array, purpose: Purpose, *indices: Array | int) -> Array:
+    """Returns the key of one use: `key` [] folded with the purpose and then each index []."""
+    for index in (int(purpose), *indices):
+        key = jax.random.fold_in(key, index)
+    return key
+
+
+def per_environment(key: Array, num_envs: int, first: Array | int = 0) -> Array:
+    """Returns one key per environment [B], by environment index, from `first` on."""
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(num_envs) + first)

@@ -1,0 +1,278 @@
+"""Training on several devices: V shards of the environments, shared by D devices.
+
+Two programs make an update. `collect` acts in one shard. It is a program of one device, the very
+same on each and called once for each shard, because a partitioned program's physics has other bits
+than an unpartitioned one's (measured: MJX with contacts). `improve` learns, all devices together.
+Initialisation and evaluation are programs of one device too.
+"""
+
+import functools
+import itertools
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
+
+from purerl.core.env import Env
+from purerl.core.records import Array, Metrics, Network, PyTree, TrainState
+from purerl.devices.compilation import Programs, jit, shapes, start, unordered, when_needed
+from purerl.devices.shards import AXIS, Shards
+from purerl.exact import xla_flags
+from purerl.ppo import algorithm
+from purerl.ppo.config import Config
+from purerl.ppo.evaluation import evaluate_in_run
+from purerl.runs.experiment import Evaluation
+
+PLACES = ("env", "carry", "episode", "discounted_return")  # fields of TrainState that are [B, ...]
+SAME = PartitionSpec()  # a copy on every device
+SPLIT = PartitionSpec(AXIS)
+
+
+class Spread(NamedTuple):
+    """A TrainState on its devices; environments by shard, of this process's devices only."""
+
+    learned: TrainState  # without PLACES; a copy on every device
+    places: tuple[dict[str, PyTree], ...]  # of each shard, on its device
+
+    @property
+    def params(self) -> PyTree:
+        """The parameters."""
+        return self.learned.params
+
+    @property
+    def steps(self) -> PyTree:
+        """Control steps taken."""
+        return self.learned.steps
+
+
+class Layout(NamedTuple):
+    """Which device computes which shards."""
+
+    shards: Shards
+    size: int  # environments in a shard
+    mesh: Mesh
+
+    @property
+    def here(self) -> list[tuple[Any, range]]:
+        """This process's devices, each with the numbers of its shards."""
+        local = self.shards.local
+        return [
+            (device, range(i * local, (i + 1) * local))
+            for i, device in enumerate(self.mesh.devices)
+            if device.process_index == jax.process_index()
+        ]
+
+
+def make_layout(shards: Shards, num_envs: int) -> Layout:
+    """Lays shards out over the first D devices, in JAX's order."""
+    devices = np.array(jax.devices()[: shards.devices])
+    mesh = Mesh(devices, (AXIS,), axis_types=(AxisType.Auto,))
+    return Layout(shards, num_envs // shards.number, mesh)
+
+
+# --- arrays ---
+
+
+def on(device: Any, tree: PyTree) -> PyTree:
+    """Returns the part of arrays of all devices that is on `device`, without a copy."""
+
+    def one(x: Array) -> Array:
+        return next(s.data for s in x.addressable_shards if s.device == device)
+
+    return jax.tree.map(one, tree)
+
+
+def assemble(layout: Layout, spec: PartitionSpec, trees: Sequence[PyTree]) -> PyTree:
+    """Makes arrays of all devices out of those of each device here, without a copy."""
+    sharding = NamedSharding(layout.mesh, spec)
+
+    def one(*parts: Array) -> Array:
+        shape = parts[0].shape
+        if spec == SPLIT:
+            shape = (shape[0] * layout.shards.devices, *shape[1:])
+        return jax.make_array_from_single_device_arrays(shape, sharding, list(parts))
+
+    return jax.tree.map(one, *trees)
+
+
+@jax.jit
+def join(trees: Sequence[PyTree]) -> PyTree:
+    """Concatenates trees of one device along the first axis."""
+    if len(trees) == 1:
+        return trees[0]
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *trees)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def cut(places: PyTree, first: Array, size: int) -> PyTree:
+    """Returns the environments from number `first` on."""
+    return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, size), places)
+
+
+@functools.cache
+def gather_all(mesh: Mesh) -> Callable[[PyTree], PyTree]:
+    """Returns a program that copies what is spread to every device."""
+    return jax.jit(lambda x: x, out_shardings=NamedSharding(mesh, SAME))
+
+
+def spread(layout: Layout, state: TrainState) -> Spread:
+    """Lays a state of one device, or of the host, out over the devices."""
+    places = {name: getattr(state, name) for name in PLACES}
+    learned = state.replace(**dict.fromkeys(PLACES))
+    size, parts = layout.size, []
+    for device, numbers in layout.here:
+        for i in numbers:
+            parts.append(jax.device_put(cut(places, np.int32(i * size), size), device))
+    copies = [jax.device_put(learned, device) for device, _ in layout.here]
+    return Spread(assemble(layout, SAME, copies), tuple(parts))
+
+
+def fetch(layout: Layout, state: Spread) -> TrainState:
+    """Returns the whole state on one device; all processes take part, and all get it."""
+    local = layout.shards.local
+    groups = [state.places[i : i + local] for i in range(0, len(state.places), local)]
+    places = assemble(layout, SPLIT, [join(group) for group in groups])
+    device = layout.here[0][0]
+    everywhere = gather_all(layout.mesh)(places)
+    return on(device, state.learned).replace(**on(device, everywhere))
+
+
+# --- programs ---
+
+
+def collect(
+    config: Config, env: Env, network: Network, learned: TrainState, places: dict, first: Array
+) -> tuple[dict[str, PyTree], algorithm.Experience]:
+    """Moves one shard on; returns its places and, stacked [1, ...], what it saw."""
+    state, experience = algorithm.collect(config, env, network, learned.replace(**places), first)
+    places = {name: getattr(state, name) for name in PLACES}
+    return places, jax.tree.map(lambda x: x[None], experience)
+
+
+def update(
+    layout: Layout,
+    collects: Sequence[Callable],
+    improve: Callable,
+    told_by: ThreadPoolExecutor,
+    state: Spread,
+) -> tuple[Spread, Metrics]:
+    """One update. Each device is told what to do by a thread of its own.
+
+    A GPU's program with a loop that the host steers returns only when it is done: told one after
+    another, devices would work one after another (measured: four H200s as fast as one).
+    """
+    local = layout.shards.local
+    # Taken apart in this thread: several at a time now and then found an array without its parts.
+    learned = [on(device, state.learned) for device, _ in layout.here]
+
+    def act(i: int) -> tuple[list[dict[str, PyTree]], PyTree]:
+        numbers, mine = layout.here[i][1], state.places[i * local : (i + 1) * local]
+        pairs = [
+            collects[i](learned[i], places, np.int32(number * layout.size))
+            for number, places in zip(numbers, mine, strict=True)
+        ]
+        return [places for places, _ in pairs], join([seen for _, seen in pairs])
+
+    places, experience = zip(*told_by.map(act, range(len(collects))), strict=True)
+    improved, metrics = improve(state.learned, assemble(layout, SPLIT, experience))
+    return Spread(improved, tuple(itertools.chain(*places))), metrics
+
+
+def compile_programs(
+    config: Config,
+    env: Env,
+    network: Network,
+    evaluation: Evaluation,
+    fresh: bool,
+    shards: Shards,
+) -> Programs:
+    """Compiles what a run on several shards calls, as `compilation` does for one device."""
+    layout = make_layout(shards, config.num_envs)
+    init = functools.partial(algorithm.init, config, env, network)
+    key = jax.random.key(0)
+    abstract = jax.eval_shape(init, key)
+    learned = abstract.replace(**dict.fromkeys(PLACES))
+    seconds: dict[str, float] = {}
+
+    begin = time.perf_counter()
+    collects, experience, sums = compile_collects(layout, config, env, network, abstract)
+    improve = jax.jit(
+        jax.shard_map(
+            functools.partial(algorithm.improve, config, network, shards=shards),
+            mesh=layout.mesh, in_specs=(SAME, SPLIT), out_specs=SAME, check_vma=False,
+        ),
+        compiler_options=xla_flags.equal_passes(),
+    )  # fmt: skip
+    whole = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((shards.number, *x.shape[1:]), x.dtype), experience
+    )
+    mesh = layout.mesh
+    traced = improve.trace(
+        shapes(learned, NamedSharding(mesh, SAME)), shapes(whole, NamedSharding(mesh, SPLIT))
+    )
+    improving = start("update", traced, seconds)
+    device = layout.here[0][0]
+    judge: Any = jax.jit(
+        functools.partial(judge_policy, config, env, network, evaluation.num_episodes, abstract)
+    )
+    here = shapes(learned, SingleDeviceSharding(device))
+    make = jit("init", init)
+    making = start("init", make.trace(key), seconds) if fresh else None
+    if evaluation.number:
+        judge = when_needed("evaluation", judge, here, seconds)
+    improve = improving.result()
+    seconds["update"] = time.perf_counter() - begin
+    return Programs(
+        init=making.result() if making else make,
+        update=functools.partial(
+            update, layout, collects, improve, ThreadPoolExecutor(len(collects))
+        ),
+        evaluate=lambda state: judge(on(device, state.learned)),
+        seconds=dict(seconds),  # the evaluation's may come later
+        unordered=sorted({*sums, *unordered(traced)}),
+        spread=functools.partial(spread, layout),
+        fetch=functools.partial(fetch, layout),
+    )
+
+
+def compile_collects(
+    layout: Layout, config: Config, env: Env, network: Network, abstract: TrainState
+) -> tuple[list[Callable], PyTree, list[str]]:
+    """Compiles `collect` for each device here; returns what it collects too, and unordered sums."""
+    program = jax.jit(functools.partial(collect, config, env, network), donate_argnums=1)
+    learned = abstract.replace(**dict.fromkeys(PLACES))
+    places = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((layout.size, *x.shape[1:]), x.dtype),
+        {name: getattr(abstract, name) for name in PLACES},
+    )
+    first = jax.ShapeDtypeStruct((), jnp.int32)
+
+    def build(device: Any) -> Any:
+        here = SingleDeviceSharding(device)
+        return program.lower(*shapes((learned, places, first), here)).compile()
+
+    (device, _), *others = layout.here
+    # The first alone: where the persistent cache serves all devices, the others find it there.
+    compiled = [build(device)]
+    with ThreadPoolExecutor() as pool:
+        compiled += pool.map(build, [device for device, _ in others])
+    traced = program.trace(learned, places, first)
+    return compiled, traced.out_info[1], unordered(traced)
+
+
+def judge_policy(
+    config: Config,
+    env: Env,
+    network: Network,
+    num_episodes: int,
+    abstract: TrainState,
+    learned: TrainState,
+) -> Metrics:
+    """Evaluates on one device, whatever their number."""
+    carry = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), abstract.carry)
+    return evaluate_in_run(config, env, network, num_episodes, learned.replace(carry=carry))

@@ -1,0 +1,145 @@
+"""Several processes, on one host or many, that train one run together.
+
+All compute the same; the first alone touches the run's folder. What only it can know (whether the
+run may be written, where it goes on, from what state) it tells the others, its errors included.
+"""
+
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from purerl.core.errors import FAILURE, RunError, StoppedError, UserError, one_line
+from purerl.core.records import PyTree, is_key
+
+HEARTBEAT = 30  # [s] after which a silent process is given up
+LONGEST = 1 << 16  # [bytes] of what the first process can tell as text
+
+
+def start(how: str) -> None:
+    """Joins the other processes; to be called before JAX is used.
+
+    Args:
+      how: "" for a process by itself, "auto" (SLURM, Open MPI, Kubernetes, TPU: what JAX detects),
+        or "HOST:PORT,NUM_PROCESSES,PROCESS_ID".
+    """
+    if not how:
+        return
+    # A signal stops all processes at the same update through `agreed`; JAX would take it from us.
+    jax.config.update("jax_enable_preemption_service", False)
+    words: dict[str, Any] = {}
+    if how != "auto":
+        try:
+            address, number, process = how.split(",")
+            words = {"num_processes": int(number), "process_id": int(process)}
+        except ValueError as error:
+            raise UserError(
+                f"distributed is {how!r}; it must be auto or HOST:PORT,NUM_PROCESSES,PROCESS_ID, "
+                "such as node1:1234,2,0."
+            ) from error
+        words["coordinator_address"] = address
+    try:
+        jax.distributed.initialize(heartbeat_timeout_seconds=HEARTBEAT, **words)
+    except (ValueError, RuntimeError) as error:
+        raise UserError(f"The processes did not find each other: {one_line(error)}") from error
+
+
+def is_first() -> bool:
+    """Tells whether this is the process that writes."""
+    return jax.process_index() == 0
+
+
+def alone(function: Callable[[], Any]) -> Any:
+    """Calls `function` in the first process only; its result (JSON) or error is everybody's."""
+    if jax.process_count() == 1:
+        return function()
+    result, caught = None, None
+    if is_first():
+        try:
+            result = function()
+        except UserError as error:
+            caught = error
+    told = json.dumps([result, str(caught) if caught else None]).encode()
+    buffer = np.zeros(LONGEST, np.uint8)
+    buffer[: len(told)] = np.frombuffer(told[:LONGEST], np.uint8)
+    result, problem = json.loads(of_first(buffer).tobytes().rstrip(b"\0"))
+    if problem:
+        raise UserError(problem)
+    return result
+
+
+def of_first(tree: PyTree) -> PyTree:
+    """Returns the first process's arrays, of the same shapes everywhere, bit for bit."""
+    from jax.experimental.multihost_utils import process_allgather
+
+    return jax.tree.map(lambda x: np.asarray(process_allgather(x))[0], tree)
+
+
+def state_of_first(state: PyTree, abstract: PyTree) -> PyTree:
+    """Returns the first process's state; the others give None."""
+    if jax.process_count() == 1:
+        return state
+
+    def one(like: Any, x: Any) -> Any:
+        raw = jax.eval_shape(jax.random.key_data, like) if is_key(like) else like
+        mine = np.zeros(raw.shape, raw.dtype)
+        if x is not None:
+            mine = np.asarray(jax.random.key_data(x) if is_key(like) else x)
+        found = jax.numpy.asarray(of_first(mine))
+        return jax.random.wrap_key_data(found) if is_key(like) else found
+
+    if state is None:
+        return jax.tree.map(lambda like: one(like, None), abstract)
+    return jax.tree.map(one, abstract, state)
+
+
+def agreed(stop: Callable[[], bool]) -> Callable[[], bool]:
+    """Returns a question that every process answers with yes as soon as one of them would."""
+    if jax.process_count() == 1:
+        return stop
+    from jax.experimental.multihost_utils import process_allgather
+
+    return lambda: bool(np.any(process_allgather(np.asarray(stop()))))
+
+
+@contextmanager
+def fail_together() -> Iterator[None]:
+    """Ends this process at once when it cannot go on with the others, or they not with it.
+
+    An orderly end would wait for processes that are gone, or that wait for this one.
+    """
+    try:
+        yield
+    except (UserError, RunError, StoppedError, SystemExit):
+        raise
+    except BaseException as error:
+        if jax.process_count() == 1:
+            raise
+        print(
+            f"purerl: process {jax.process_index()} of {jax.process_count()} cannot go on, or "
+            f"another is gone: {one_line(error)[:300]} Start all of them again, with --resume.",
+            file=sys.stderr,
+            flush=True,
+        )
+        os._exit(FAILURE)
+
+
+class Silent:
+    """Stands for the progress display and the recorder of a process that is not the first."""
+
+    digest = None
+
+    def __init__(self, folder: Path | None = None) -> None:
+        """Names the run's checkpoints, for messages."""
+        self.checkpoints = folder / "checkpoints" if folder else None
+        self.say = self.show = self.write = self._nothing
+        self.save = self.finish = self.close = self._nothing
+
+    def _nothing(self, *arguments: Any) -> None:
+        """Does nothing."""

@@ -1,0 +1,304 @@
+"""Loops over a few numbers and one long axis on a GPU, each as one kernel.
+
+In every round MJX's line search adds up three numbers of each constraint, for three points, and
+chooses between them. XLA makes four kernels of a round, and each waits for the one before. Here one
+warp makes all rounds of an environment: what they read and carry stays in its registers. What it
+computes is the trace of the loop's body, equation by equation; where there is no rule for one of
+them, the loop stays XLA's (elliptic cones, equalities, friction in joints or tendons).
+
+A value of the trace is an object array of the same rank. Its entries are numbers or, where one of
+its axes is the long one (size 1 here), vectors along it, [m]: m is the next power of 2 from n on.
+"""
+
+import functools
+import math
+import operator
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.extend import core
+
+from purerl.core.records import Array
+from purerl.exact import pallas_calls
+from purerl.exact.constants import CALLS, called_jaxpr
+from purerl.exact.traced_loops import equations, sub_jaxprs
+
+SHORT = 4  # entries of any other axis, at most
+LONGEST = 512  # of the long one: 16 registers of each thread for a vector
+Value = np.ndarray
+
+
+class Long(NamedTuple):
+    """The long axis in a kernel."""
+
+    size: int  # n
+    lane: Array  # [m] numbers of the entries
+    inside: Array  # [m] bool: which of them there are
+
+
+def wanted(eqn: core.JaxprEqn) -> bool:
+    """Tells whether an equation is a loop to be computed by one kernel."""
+    if eqn.primitive.name != "scan" or not pallas_calls.can_run():
+        return False
+    body = eqn.params["jaxpr"]
+    carries_all = [v.aval for v in body.jaxpr.outvars] == [v.aval for v in eqn.outvars]
+    reads_all = [v.aval for v in body.jaxpr.invars] == [v.aval for v in eqn.invars]
+    return carries_all and reads_all and _long_size(body) is not None
+
+
+def _long_size(body: core.ClosedJaxpr) -> int | None:
+    """Returns n; None if there is no long axis or more than one, or an equation without a rule."""
+    if not all(map(_has_rule, equations(body))):
+        return None
+    traced = list(equations(body))
+    inner = [sub for eqn in traced for sub in sub_jaxprs(eqn)]
+    consts = [np.shape(const) for closed in (body, *inner) for const in closed.consts]
+    shapes = {_shape(v) for v in body.jaxpr.invars}
+    shapes |= {_shape(v) for eqn in traced for v in (*eqn.invars, *eqn.outvars)}
+    long_const = any(n > SHORT for shape in consts for n in shape)
+    if long_const or any(0 in shape for shape in shapes):
+        return None
+    longer = [[n for n in shape if n > SHORT] for shape in shapes]
+    sizes = {n for found in longer for n in found}
+    one = len(sizes) == 1 and max(map(len, longer)) == 1 and max(sizes) <= LONGEST
+    return sizes.pop() if one else None
+
+
+def _shape(atom: Any) -> tuple[int, ...]:
+    return atom.aval.shape
+
+
+def _has_rule(eqn: core.JaxprEqn) -> bool:
+    name, values = eqn.primitive.name, [cast(Any, v.aval) for v in (*eqn.invars, *eqn.outvars)]
+    if name == "dynamic_slice" and (values[0].ndim > 1 or eqn.params["slice_sizes"] != (1,)):
+        return False
+    if name == "select_n" and len(eqn.invars) > 3:  # Triton chooses between two
+        return False
+    short = all(n <= SHORT for value in values for n in value.shape)
+    known = name in _RULES and all(value.dtype in _DTYPES for value in values)
+    return known and (short or name not in _OF_SHORT_AXES)
+
+
+def compute(eqn: core.JaxprEqn, inputs: Sequence[Array]) -> list[Array]:
+    """Computes a loop that is `wanted`."""
+    body = eqn.params["jaxpr"]
+    size = _long_size(body)
+    assert size is not None, "not wanted"
+    kernel = functools.partial(_kernel, body, eqn.params["length"], size)
+    results = [jax.ShapeDtypeStruct(a.shape, _kept(a.dtype)) for a in body.out_avals]
+    pairs = zip(inputs, body.in_avals, strict=True)
+    found = pallas_calls.call(kernel, results, *(jnp.asarray(x, _kept(a.dtype)) for x, a in pairs))
+    return [x.astype(a.dtype) for x, a in zip(found, body.out_avals, strict=True)]
+
+
+def _kept(dtype: Any) -> Any:
+    """Returns the type in which a kernel reads and writes: truth as whole numbers."""
+    return jnp.int32 if dtype == jnp.bool_ else dtype
+
+
+def _kernel(body: core.ClosedJaxpr, length: int, size: int, *references: Any) -> None:
+    """Reads all there is, makes all rounds, and writes what they carry."""
+    lane = lax.iota(jnp.int32, 1 << (size - 1).bit_length())
+    long = Long(size, lane, lane < size)
+    avals, number = body.in_avals, len(body.in_avals)
+    values = [_load(long, ref, a) for ref, a in zip(references[:number], avals, strict=True)]
+    consts = values[: number - len(body.out_avals)]
+    carry = values[len(consts) :]
+    shapes = [value.shape for value in carry]
+
+    def step(i: Array, flat: list[Array]) -> list[Array]:
+        new = _flat(_evaluate(long, body, *consts, *_values(shapes, flat)))
+        # What a round sets to a number becomes what is carried: a vector, or no literal.
+        return [jnp.where(i >= 0, a, b) for a, b in zip(new, flat, strict=True)]
+
+    carry = _values(shapes, lax.fori_loop(0, length, step, _flat(carry)))
+    for ref, value in zip(references[number:], carry, strict=True):
+        _store(long, ref, value)
+
+
+# --- values ---
+
+
+def _value(shape: Sequence[int], entries: Iterable[Any]) -> Value:
+    value = np.empty(tuple(shape), object)
+    for place, entry in zip(np.ndindex(value.shape), entries, strict=True):
+        value[place] = entry
+    return value
+
+
+def _values(shapes: Sequence[tuple[int, ...]], flat: Sequence[Array]) -> list[Value]:
+    left = iter(flat)
+    return [_value(shape, [next(left) for _ in range(math.prod(shape))]) for shape in shapes]
+
+
+def _flat(values: Iterable[Value]) -> list[Array]:
+    return [entry for value in values for entry in value.flat]
+
+
+def _places(long: Long, shape: Sequence[int]) -> list[tuple[Any, ...]]:
+    """Returns where each entry of a value stands in an array."""
+    short = [1 if n > SHORT else n for n in shape]
+    return [
+        tuple(long.lane if n > SHORT else i for n, i in zip(shape, place, strict=True))
+        for place in np.ndindex(*short)
+    ]
+
+
+def _load(long: Long, ref: Any, aval: Any) -> Value:
+    from jax.experimental.pallas import triton
+
+    is_long = any(n > SHORT for n in aval.shape)
+    entries = [
+        triton.load(ref.at[place], mask=long.inside, other=0) if is_long else ref[place]
+        for place in _places(long, aval.shape)
+    ]
+    if aval.dtype == jnp.bool_:
+        entries = [entry != 0 for entry in entries]
+    return _value([1 if n > SHORT else n for n in aval.shape], entries)
+
+
+def _store(long: Long, ref: Any, value: Value) -> None:
+    from jax.experimental.pallas import triton
+
+    is_long = any(n > SHORT for n in ref.shape)
+    for place, entry in zip(_places(long, ref.shape), value.flat, strict=True):
+        kept = entry.astype(ref.dtype)
+        if is_long:
+            kept = jnp.broadcast_to(kept, long.lane.shape)
+            triton.store(ref.at[place], kept, mask=long.inside)
+        else:
+            ref[place] = kept
+
+
+def _evaluate(long: Long, closed: core.ClosedJaxpr, *args: Value) -> list[Value]:
+    """Runs a trace."""
+    values: dict[Any, Value] = {}
+
+    def read(atom: Any) -> Value:
+        return values[atom] if isinstance(atom, core.Var) else _constant(atom.val, atom.aval.dtype)
+
+    consts = [_constant(x, jnp.result_type(x)) for x in closed.consts]
+    values.update(zip(closed.jaxpr.constvars, consts, strict=True))
+    values.update(zip(closed.jaxpr.invars, args, strict=True))
+    for eqn in closed.jaxpr.eqns:
+        outputs = _RULES[eqn.primitive.name](long, eqn, *map(read, eqn.invars))
+        values.update(zip(eqn.outvars, outputs, strict=True))
+    return [read(v) for v in closed.jaxpr.outvars]
+
+
+def _constant(x: Any, dtype: Any) -> Value:
+    return _value(np.shape(x), [jnp.asarray(entry, dtype) for entry in np.asarray(x).flat])
+
+
+def _map(function: Callable[..., Array], *args: Value) -> Value:
+    """Calls `function` for the entries that stand at the same place."""
+    spread = np.broadcast_arrays(*args)
+    entries = zip(*(value.flat for value in spread), strict=True)
+    return _value(spread[0].shape, (function(*entry) for entry in entries))
+
+
+def _rows(value: Value, axis: int) -> list[Value]:
+    rows = np.moveaxis(value, axis, 0)
+    return [rows[i : i + 1].reshape(rows.shape[1:]) for i in range(len(rows))]
+
+
+# --- a rule for each primitive: (long, equation, *inputs) -> outputs ---
+
+
+def _elementwise(long: Long, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
+    def one(*entries: Array) -> Array:
+        shape = np.broadcast_shapes(*map(jnp.shape, entries))  # a number beside vectors
+        return eqn.primitive.bind(*(jnp.broadcast_to(x, shape) for x in entries), **eqn.params)
+
+    return [_map(one, *args)]
+
+
+def _sum(long: Long, eqn: core.JaxprEqn, value: Value) -> list[Value]:
+    if any(_shape(eqn.invars[0])[axis] > SHORT for axis in eqn.params["axes"]):
+        value = _map(functools.partial(_sum_along, long), value)
+    return _fold(operator.add, long, eqn, value)
+
+
+def _sum_along(long: Long, x: Array) -> Array:
+    return jnp.sum(jnp.where(long.inside, x, 0)) if x.ndim else x * long.size
+
+
+def _fold(combine: Callable, long: Long, eqn: core.JaxprEqn, value: Value) -> list[Value]:
+    for axis in sorted(eqn.params["axes"], reverse=True):
+        value = functools.reduce(functools.partial(_map, combine), _rows(value, axis))
+    return [value]
+
+
+def _argmin(long: Long, eqn: core.JaxprEqn, value: Value) -> list[Value]:
+    """The first of the least; a NaN is less than any number."""
+    (axis,) = eqn.params["axes"]
+    least, *others = _rows(value, axis)
+    place = _map(lambda _: jnp.zeros((), eqn.params["index_dtype"]), least)
+    for number, row in enumerate(others, 1):
+        less = _map(lambda a, b: (a < b) | ((a != a) & (b == b)), row, least)
+        least = _map(jnp.where, less, row, least)
+        place = _map(jnp.where, less, _map(lambda p, i=number: jnp.full_like(p, i), place), place)
+    return [place]
+
+
+def _broadcast(long: Long, eqn: core.JaxprEqn, value: Value) -> list[Value]:
+    shape = [1 if n > SHORT else n for n in eqn.params["shape"]]
+    spread = np.ones(len(shape), int)
+    spread[list(eqn.params["broadcast_dimensions"])] = value.shape
+    return [np.broadcast_to(value.reshape(tuple(spread)), shape)]
+
+
+def _slice(long: Long, eqn: core.JaxprEqn, value: Value) -> list[Value]:
+    starts, limits = eqn.params["start_indices"], eqn.params["limit_indices"]
+    strides = eqn.params["strides"] or (1,) * value.ndim
+    return [value[tuple(map(slice, starts, limits, strides))]]
+
+
+def _dynamic_slice(long: Long, eqn: core.JaxprEqn, value: Value, start: Value) -> list[Value]:
+    """One entry of [k], k short; an index beyond the ends is the end's."""
+    rows = _rows(value, 0)
+    found = rows[0]
+    for number, row in enumerate(rows[1:], 1):
+        found = _map(lambda i, a, b, n=number: jnp.where(i >= n, a, b), start, row, found)
+    return [found.reshape(1)]
+
+
+def _squeeze(long: Long, eqn: core.JaxprEqn, value: Value) -> list[Value]:
+    return [value.reshape(_shape(eqn.outvars[0]))]
+
+
+def _cond(long: Long, eqn: core.JaxprEqn, index: Value, *args: Value) -> list[Value]:
+    """All branches, then a choice."""
+    found, *others = (_evaluate(long, branch, *args) for branch in eqn.params["branches"])
+    for number, other in enumerate(others, 1):
+        chosen = _map(lambda i, n=number: i.astype(jnp.int32) >= n, index)
+        found = [_map(jnp.where, chosen, a, b) for a, b in zip(other, found, strict=True)]
+    return found
+
+
+def _called(long: Long, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
+    return _evaluate(long, called_jaxpr(eqn), *args)
+
+
+# Not min and max, of which Triton's lose a NaN.
+_NAMES = """abs add and convert_element_type div eq ge gt le lt mul ne not or select_n sqrt square
+sub""".split()  # noqa: SIM905
+_DTYPES = (jnp.float32, jnp.int32, jnp.bool_)
+_RULES: dict[str, Callable[..., list[Value]]] = {
+    **dict.fromkeys(_NAMES, _elementwise),
+    "argmin": _argmin,
+    "broadcast_in_dim": _broadcast,
+    "cond": _cond,
+    "dynamic_slice": _dynamic_slice,
+    "reduce_or": functools.partial(_fold, operator.or_),
+    "reduce_sum": _sum,
+    "slice": _slice,
+    "squeeze": _squeeze,
+    "stack": lambda long, eqn, *values: [np.stack(values, eqn.params["axis"])],
+    **dict.fromkeys(CALLS, _called),
+}
+_OF_SHORT_AXES = ("argmin", "dynamic_slice", "reduce_or", "slice", "squeeze", "stack")

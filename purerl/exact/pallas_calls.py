@@ -1,0 +1,79 @@
+"""Kernels of our own, written in Pallas: where they can run, and how they are called."""
+
+import importlib.util
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from purerl.core.records import Array
+
+AT_ONCE = 32  # arrays that one kernel copies: each takes registers
+BLOCK = 128  # entries of each that a warp copies, four a thread
+
+
+def can_run() -> bool:
+    """Tells whether programs are for a GPU, and JAX has Triton's part of Pallas.
+
+    JAX means to remove it; then XLA's kernels and loops are used.
+    """
+    if jax.default_backend() != "gpu":
+        return False
+    try:
+        return importlib.util.find_spec("jax.experimental.pallas.triton") is not None
+    except ModuleNotFoundError:  # not even what it is a part of
+        return False
+
+
+def call(
+    kernel: Callable[..., None],
+    results: list[jax.ShapeDtypeStruct],
+    *inputs: Array,
+    grid: tuple[int, ...] = (),
+) -> list[Array]:
+    """Runs a kernel in one warp, or in a `grid` of them; vmapped, in so many for each.
+
+    Args:
+      kernel: takes a reference to each input, then to each result, and writes the results.
+      results: their shapes and dtypes.
+      *inputs: the arrays to read.
+      grid: number of warps along each axis; `pallas.program_id` tells a kernel which it is.
+    """
+    # Imported here: it takes 0.1 s, of which a run on CPUs need not wait.
+    from jax.experimental import pallas
+    from jax.experimental.pallas import triton
+
+    return pallas.pallas_call(
+        kernel,
+        results,
+        grid=grid,
+        compiler_params=triton.CompilerParams(num_warps=1),
+        interpret=jax.default_backend() == "cpu",
+    )(*inputs)
+
+
+def copy(rows: list[Array]) -> list[Array]:
+    """Returns arrays [n] as they are, copied by kernels of which XLA does not know what they do."""
+    copied: list[Array] = []
+    for some in (rows[i : i + AT_ONCE] for i in range(0, len(rows), AT_ONCE)):
+        results = [jax.ShapeDtypeStruct(row.shape, row.dtype) for row in some]
+        blocks = -(-max(row.size for row in some) // BLOCK)
+        copied += call(_copy_kernel, results, *some, grid=(blocks,))
+    return copied
+
+
+def _copy_kernel(*references: Any) -> None:
+    """Copies a block of each array, if it has so many: all are read before one is written."""
+    from jax.experimental import pallas
+    from jax.experimental.pallas import triton
+
+    half = len(references) // 2
+    place = pallas.program_id(0) * BLOCK + jnp.arange(BLOCK)
+    inside = [place < reference.shape[0] for reference in references[:half]]
+    read = [
+        triton.load(reference.at[place], mask=mask)
+        for reference, mask in zip(references[:half], inside, strict=True)
+    ]
+    for reference, values, mask in zip(references[half:], read, inside, strict=True):
+        triton.store(reference.at[place], values, mask=mask)

@@ -1,0 +1,140 @@
+"""Scatters with constant indices as gathers; a scatter-add's sums have a fixed order."""
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.extend import core
+
+from purerl.core.records import Array
+from purerl.exact.constants import Known
+
+_FEW_TERMS = 4
+
+
+def ordered_scatter(eqn: core.JaxprEqn, inputs: list, known: list[Known]) -> Array:
+    """A scatter-add as gathers added in the order of the updates.
+
+    Raises:
+      RuntimeError: the primitive is not a scatter-add, or its indices are not known.
+    """
+    operand, _, updates = inputs
+    if known[1] is None or "add" not in eqn.primitive.name:
+        raise RuntimeError(
+            f"A {eqn.primitive.name} traced at {source(eqn)} has indices that are known "
+            "only while running, so its sum has no fixed order on a GPU. Ask for fewer readings, "
+            "or change the model so that MJX does not need it."
+        )
+    addresses = _addresses(eqn, np.asarray(known[1]()))
+    touched, turns = _order_of_sums(addresses, updates.size)
+    whole, flat = jnp.reshape(operand, (-1,)), jnp.reshape(updates, (-1,))
+    if (turns == updates.size).any():
+        flat = jnp.concatenate([flat, jnp.zeros(1, flat.dtype)])
+    total = _take(whole, touched)
+    if len(turns) <= _FEW_TERMS:
+        for turn in turns:
+            total = total + _take(flat, turn)
+    else:
+        # One gather and one reduction: a long chain of sums takes XLA minutes to compile.
+        total = total + jnp.sum(_take(flat, turns), axis=0)
+    place = np.arange(operand.size)
+    place[touched] = operand.size + np.arange(len(touched))
+    return jnp.reshape(_take(jnp.concatenate([whole, total]), place), operand.shape)
+
+
+def puts(eqn: core.JaxprEqn) -> bool:
+    """Says whether an equation is a scatter that puts updates in their places, as `.set` does.
+
+    `.apply` is called the same, and computes something of what stands there.
+    """
+    return eqn.primitive.name == "scatter" and eqn.params["update_jaxpr"] is None
+
+
+def gathered_scatter(eqn: core.JaxprEqn, inputs: list, known: list[Known]) -> Array:
+    """A scatter that `puts`, with constant indices, as one gather; of updates that meet, the last.
+
+    XLA has two kernels for a scatter, one of them a copy, and neither is fused with others. It
+    leaves open which of several updates is kept; the last here is the last in row-major order.
+    """
+    operand, _, updates = inputs
+    addresses = _addresses(eqn, np.asarray(known[1]()))
+    kept = np.flatnonzero(addresses >= 0)
+    if not kept.size:
+        return operand
+    place = np.full(operand.size, -1)
+    place[addresses[kept]] = kept
+    put = jnp.reshape(_take(jnp.reshape(updates, (-1,)), np.maximum(place, 0)), operand.shape)
+    return jnp.where(np.reshape(place >= 0, operand.shape), put, operand)
+
+
+def _take(flat: Array, index: np.ndarray) -> Array:
+    """`flat[index]` of constant indices within bounds, as one operation."""
+    first = index.flat[0] if index.size else 0
+    if index.ndim == 1 and (index == first + np.arange(index.size)).all():
+        return lax.slice(flat, (first,), (first + index.size,))
+    numbers = lax.GatherDimensionNumbers((), (0,), (0,))
+    index = index.astype(np.int32)[..., None]
+    return lax.gather(flat, index, numbers, (1,), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
+
+
+def _addresses(eqn: core.JaxprEqn, indices: np.ndarray) -> np.ndarray:
+    """Returns for each update the flat address it is added to; -1 where it is dropped.
+
+    By XLA's definition of a scatter: each index vector says where a window of updates starts, and
+    a window that does not fit is dropped whole, or moved until it fits (mode CLIP).
+    """
+    shape, updates = eqn.invars[0].aval.shape, eqn.invars[2].aval
+    d = eqn.params["dimension_numbers"]
+    batch_axes = [i for i in range(len(updates.shape)) if i not in d.update_window_dims]
+    batch = tuple(updates.shape[i] for i in batch_axes)
+    absent = (*d.inserted_window_dims, *d.operand_batching_dims)
+    axis_of = dict(
+        zip([i for i in range(len(shape)) if i not in absent], d.update_window_dims, strict=True)
+    )
+    starts = np.zeros((len(shape), *batch), np.int64)
+    for column, dim in enumerate(d.scatter_dims_to_operand_dims):
+        starts[dim] = indices[..., column]
+    for dim, axis in zip(d.operand_batching_dims, d.scatter_indices_batching_dims, strict=True):
+        starts[dim] = np.indices(batch)[axis]
+    sizes = [updates.shape[axis_of[i]] if i in axis_of else 1 for i in range(len(shape))]
+    room = (np.array(shape) - sizes).reshape(-1, *[1] * len(batch)).astype(np.int64)
+    if eqn.params["mode"] == lax.GatherScatterMode.CLIP:
+        starts = np.clip(starts, 0, room)
+    fits = ((starts >= 0) & (starts <= room)).all(0)
+    address = np.zeros(updates.shape, np.int64)
+    steps = np.cumprod([1, *shape[:0:-1]])[::-1] if shape else []
+    spread = tuple(i for i in range(len(updates.shape)) if i not in batch_axes)
+    for dim, step in enumerate(steps):
+        address += step * np.expand_dims(starts[dim], spread)
+        if dim in axis_of:
+            along = [1] * len(updates.shape)
+            along[axis_of[dim]] = sizes[dim]
+            address += step * np.arange(sizes[dim]).reshape(along)
+    return np.where(np.expand_dims(fits, spread), address, -1).reshape(-1)
+
+
+def _order_of_sums(address: np.ndarray, none: int) -> tuple[np.ndarray, np.ndarray]:
+    """Sorts updates by the address that they are added to.
+
+    Args:
+      address: [updates]; -1 where an update is dropped.
+      none: what stands for no update.
+
+    Returns:
+      The addresses that receive any, [touched], ascending; and the number of the k-th update of
+      each, [turns, touched].
+    """
+    kept = np.flatnonzero(address >= 0)
+    order = kept[np.argsort(address[kept], kind="stable")]
+    touched, start, count = np.unique(address[order], return_index=True, return_counts=True)
+    turns = np.full((count.max(initial=0), len(touched)), none)
+    turn = np.arange(len(order)) - np.repeat(start, count)
+    turns[turn, np.repeat(np.arange(len(touched)), count)] = order
+    return touched, turns
+
+
+def source(eqn: core.JaxprEqn) -> str:
+    """Returns the file and line that traced an equation, outside of JAX itself."""
+    traceback = eqn.source_info.traceback
+    frames = traceback.frames if traceback else []
+    own = [f for f in frames if "/jax/_src/" not in f.file_name] or frames
+    return f"{own[0].file_name}:{own[0].line_num}" if own else "an unknown line"

@@ -1,0 +1,115 @@
+"""What a trace tells of a loop before it runs."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax.numpy as jnp
+from jax.extend import core
+
+from purerl.exact.constants import Known
+
+# A scan makes all its rounds. Beyond so many, the loop most likely ends far earlier: MuJoCo's
+# default is 100 iterations, of which a cartpole needs two.
+MOST_ROUNDS = 16
+# Rounds written out one after another on a GPU, where every round copies what the loop carries: an
+# ant's physics alone was faster by 9%, its four rounds of line search written out (H100). That is
+# where `loop_kernels` does not take the loop.
+WRITTEN_OUT = 4
+# Equations of a round to be written out. A line search has 300; a whole physics step, 6,000 for six
+# hinges, took three times as long to compile.
+FEW_EQUATIONS = 1000
+# Of what a loop reads XLA leaves the order in memory as it is. Where a line search reads [108, 3],
+# one thread adds the 108 of a column; of [3, 108] a warp does, for all columns in one kernel.
+MANY_ROWS = 32
+FEW_COLUMNS = 4
+
+
+def sub_jaxprs(eqn: core.JaxprEqn) -> list[core.ClosedJaxpr]:
+    """Returns the traces inside one equation (loop bodies, branches, called functions)."""
+    found = []
+    for value in eqn.params.values():
+        for item in value if isinstance(value, tuple | list) else (value,):
+            if isinstance(item, core.ClosedJaxpr):
+                found.append(item)
+            elif isinstance(item, core.Jaxpr):
+                found.append(core.ClosedJaxpr(item, ()))
+    return found
+
+
+def equations(closed: core.ClosedJaxpr) -> Iterator[core.JaxprEqn]:
+    """Yields all equations of a trace, at any depth, each before those inside of it."""
+    for eqn in closed.jaxpr.eqns:
+        yield eqn
+        for sub in sub_jaxprs(eqn):
+            yield from equations(sub)
+
+
+def has_loop(closed: core.ClosedJaxpr) -> bool:
+    """Tells whether a trace loops, at any depth, and not in rounds that are all written out."""
+    return any(map(is_loop, equations(closed)))
+
+
+def is_loop(eqn: core.JaxprEqn) -> bool:
+    """Tells whether an equation is a loop."""
+    name, params = eqn.primitive.name, eqn.params
+    return name == "while" or (name == "scan" and params["unroll"] < params["length"])
+
+
+def is_written_out(eqn: core.JaxprEqn) -> bool:
+    """Tells whether rounds of a loop pay written out: a short scan with no loop inside.
+
+    As MJX's line search is, where it is not one kernel (`loop_kernels`).
+    """
+    if eqn.primitive.name != "scan" or eqn.params["unroll"] > 1:
+        return False
+    body = eqn.params["jaxpr"]
+    return not has_loop(body) and sum(1 for _ in equations(body)) < FEW_EQUATIONS
+
+
+def is_tall(x: Any) -> bool:
+    """Tells whether an array has many rows of few numbers, [n, k]."""
+    return jnp.ndim(x) == 2 and x.shape[1] <= FEW_COLUMNS and x.shape[0] >= MANY_ROWS
+
+
+def rounds(params: dict, known: list[Known]) -> int | None:
+    """Returns the most rounds of a `while` that counts to a constant, None of any other.
+
+    Its condition fails when a counter reaches a literal, whatever else ends it earlier, and each
+    round adds 1 to the counter.
+    """
+    n, m = params["cond_nconsts"], params["body_nconsts"]
+    test, body = params["cond_jaxpr"].jaxpr, params["body_jaxpr"].jaxpr
+    for counter, limit in _limits(test):
+        place = test.invars.index(counter) - n if counter in test.invars else -1
+        if place < 0 or known[n + m + place] is None:
+            continue
+        steps = [e for e in body.eqns if body.outvars[place] in e.outvars]
+        if steps and steps[0].primitive.name == "add" and _is_plus_one(steps[0], body, m + place):
+            return max(0, limit - int(known[n + m + place]()))
+    return None
+
+
+def _limits(test: core.Jaxpr) -> list[tuple[core.Var | core.Literal, int]]:
+    """Returns each (variable, literal) for which variable >= literal alone makes `test` false."""
+    made_by = {v: e for e in test.eqns for v in e.outvars}
+    first = made_by.get(test.outvars[0])
+    if first is None or first.primitive.name != "not":
+        return []
+    ends, found = [first.invars[0]], []
+    while ends:
+        eqn = None if isinstance(ends[-1], core.Literal) else made_by.get(ends[-1])
+        ends.pop()
+        if eqn is None:
+            continue
+        if eqn.primitive.name in ("or", "convert_element_type"):
+            ends += eqn.invars
+        elif eqn.primitive.name == "ge" and isinstance(eqn.invars[1], core.Literal):
+            limit = eqn.invars[1].val
+            if jnp.issubdtype(jnp.result_type(limit), jnp.integer):  # 2.5 is no number of rounds
+                found.append((eqn.invars[0], int(limit)))
+    return found
+
+
+def _is_plus_one(eqn: core.JaxprEqn, body: core.Jaxpr, place: int) -> bool:
+    number, one = eqn.invars
+    return number is body.invars[place] and isinstance(one, core.Literal) and int(one.val) == 1

@@ -1,0 +1,208 @@
+"""The `jax` engine: MJX, traced once, with every sum in a fixed order."""
+
+import contextlib
+import io
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax.extend import core
+
+from purerl.core.records import Array, PyTree
+from purerl.exact.rewrite import trace_deterministic
+
+with contextlib.redirect_stdout(io.StringIO()):  # it prints that warp, which is optional, is absent
+    from mujoco import mjx
+    from mujoco.mjx._src import forward, sensor, smooth
+
+_IN_IMPL = ("cinert", "crb", "ten_velocity", "actuator_velocity", "subtree_linvel")
+_IN_IMPL += ("subtree_angmom", "cacc", "cfrc_int", "cfrc_ext")
+
+
+class JaxEngine:
+    """Steps a model with MJX; see `physics.Physics` for what `init` and `step` promise."""
+
+    def __init__(self, model: mujoco.MjModel, record: Any, late: tuple[str, ...], substeps: int):
+        """Puts the model on the device.
+
+        Args:
+          model: the model.
+          record: the NamedTuple of readings.
+          late: the readings that are those of the last substep.
+          substeps: physics steps in one control step.
+
+        Raises:
+          ValueError: MJX refuses the model, or would leave out a part of it without a word.
+        """
+        check_known(model)
+        self.record, self.late, self.substeps = record, late, substeps
+        self.shapes = reading_shapes(model, record._fields)
+        with mjx_defaults():
+            self.model = put_model(model)
+            self.data = mjx.make_data(model, device=_own_device(), impl="jax")
+        self._traces: dict[Any, core.ClosedJaxpr] = {}
+        self._functions: dict[Any, Callable] = {}
+
+    def init(self, state: PyTree, changes: dict[str, Array]) -> tuple:
+        """Returns the readings at `state` under no control."""
+        return self.record(*self._run(self._init, state, changes))
+
+    def step(self, state: PyTree, ctrl: Array, changes: dict[str, Array]) -> tuple[PyTree, tuple]:
+        """Advances one control step."""
+        flat = self._run(self._step, state, ctrl, changes)
+        leaves, structure = jax.tree.flatten(state)
+        n = len(leaves)
+        return jax.tree.unflatten(structure, flat[:n]), self.record(*flat[n:])
+
+    def trace(self, state: PyTree, ctrl: Array, changes: dict[str, Array]) -> core.ClosedJaxpr:
+        """Returns the rewritten trace of `step`, for inspection."""
+        return self._trace(self._step, state, ctrl, changes)
+
+    def _run(self, function, *args: PyTree) -> list[Array]:
+        """Runs the trace of `function`, made once for each set of shapes.
+
+        MJX takes seconds to trace; reset, training and evaluation share one trace.
+        """
+        closed = self._trace(function, *args)
+        if id(closed) not in self._functions:
+            # jit for a caller who has none: thousands of operations one by one take minutes.
+            self._functions[id(closed)] = jax.jit(core.jaxpr_as_fun(closed), inline=True)
+        return self._functions[id(closed)](*jax.tree.leaves(args))
+
+    def _trace(self, function, *args: PyTree) -> core.ClosedJaxpr:
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), args)
+        leaves, structure = jax.tree.flatten(shapes)
+        key = (function.__name__, structure, tuple((s.shape, s.dtype) for s in leaves))
+        if key not in self._traces:
+            with mjx_defaults():
+                self._traces[key] = trace_deterministic(function, *shapes)
+        return self._traces[key]
+
+    def _init(self, state: PyTree, changes: dict[str, Array]) -> list[Array]:
+        model = self.model.tree_replace(changes) if changes else self.model
+        data = _forward(model, load_state(self.data, state), bool(self.late))
+        return self._read(data)
+
+    def _step(self, state: PyTree, ctrl: Array, changes: dict[str, Array]) -> list[Array]:
+        model = self.model.tree_replace(changes) if changes else self.model
+
+        def substep(carry, _):
+            data = load_state(self.data, carry[0]).replace(ctrl=ctrl)
+            after = mjx.step(model, data)
+            late = _forward(model, data, True) if self.late and _forgets_sensors(data) else after
+            return (save_state(carry[0], after), [field_of(late, n) for n in self.late]), None
+
+        start = [jnp.zeros(field_of(self.data, n).shape) for n in self.late]
+        (state, late), _ = jax.lax.scan(substep, (state, start), None, self.substeps)
+        data = load_state(self.data, state).tree_replace(
+            {_place(n): v for n, v in zip(self.late, late, strict=True)}
+        )
+        return jax.tree.leaves(state) + self._read(_kinematics(model, data))
+
+    def _read(self, data: mjx.Data) -> list[Array]:
+        fields = self.record._fields
+        return [jnp.reshape(field_of(data, n), self.shapes[n]).astype(jnp.float32) for n in fields]
+
+
+def check_known(model: mujoco.MjModel) -> None:
+    """Raises ValueError for what MJX leaves out silently: the motion would be another than C's."""
+    polynomials = ("jnt_stiffnesspoly", "dof_dampingpoly", "tendon_stiffnesspoly")
+    polynomials += ("tendon_dampingpoly",)
+    bits = (mujoco.mjtDisableBit.mjDSBL_SPRING, mujoco.mjtDisableBit.mjDSBL_DAMPER)
+    passive = [bool(model.opt.disableflags & int(bit)) for bit in bits]
+    left_out = {
+        f"noslip_iterations = {model.opt.noslip_iterations}": model.opt.noslip_iterations,
+        "only one of springs and dampers disabled": passive[0] != passive[1],
+    }
+    left_out |= {f"a non-zero {name}": getattr(model, name).any() for name in polynomials}
+    for what, there in left_out.items():
+        if there:
+            raise ValueError(
+                f"The model has {what}, which MJX does not have and leaves out without a word: "
+                "remove it, on every engine, or use engine 'c'."
+            )
+
+
+def put_model(model: mujoco.MjModel) -> mjx.Model:
+    """Puts a model on the device; ValueError if MJX cannot simulate it."""
+    try:
+        return mjx.put_model(model, device=_own_device(), impl="jax")
+    except NotImplementedError as error:
+        raise ValueError(
+            f"MJX cannot simulate this model: {error} Change the model, or use engine 'c'."
+        ) from error
+
+
+def _own_device() -> jax.Device:
+    """Returns this process's first device; MJX by itself takes the first of all processes."""
+    return jax.local_devices()[0]
+
+
+def reading_shapes(model: mujoco.MjModel, names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
+    """Returns each reading's shape; rotation matrices are [n, 3, 3] on every engine."""
+    data = mujoco.MjData(model)
+    shapes = {name: np.shape(getattr(data, name)) for name in names}
+    matrices = ("xmat", "ximat", "geom_xmat", "site_xmat", "cam_xmat")
+    return {n: (s[0], 3, 3) if n in matrices else s for n, s in shapes.items()}
+
+
+def mjx_defaults() -> contextlib.ExitStack:
+    """MJX relies on implicit promotion: its tracing is exempt from a caller's stricter rules.
+
+    Its matrix products are whole float32 ones: a GPU's default has 10 bits of mantissa (TF32).
+    """
+    stack = contextlib.ExitStack()
+    stack.enter_context(jax.default_matmul_precision("highest"))
+    stack.enter_context(jax.numpy_dtype_promotion("standard"))
+    stack.enter_context(jax.numpy_rank_promotion("allow"))
+    return stack
+
+
+def _place(name: str) -> str:
+    """Where `mjx.Data` keeps a field."""
+    return f"_impl.{name}" if name in _IN_IMPL else name
+
+
+def field_of(data: mjx.Data, name: str) -> Array:
+    """Returns a field of `mjx.Data`, wherever it is kept."""
+    return getattr(data._impl if name in _IN_IMPL else data, name)
+
+
+def load_state(data: mjx.Data, state: PyTree) -> mjx.Data:
+    """Puts an integration state into a blank `mjx.Data`."""
+    return data.replace(**{name: getattr(state, name) for name in state.__dataclass_fields__})
+
+
+def save_state(state: PyTree, data: mjx.Data) -> PyTree:
+    """Takes the integration state out of an `mjx.Data`."""
+    return state.replace(**{name: getattr(data, name) for name in state.__dataclass_fields__})
+
+
+def _kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Makes position- and velocity-dependent fields current, without collision or constraints.
+
+    What no reading uses is dropped by the compiler.
+    """
+    data = smooth.kinematics(model, data)
+    data = smooth.com_pos(model, data)
+    data = smooth.camlight(model, data)
+    data = smooth.tendon(model, data)
+    data = smooth.crb(model, data)
+    data = smooth.transmission(model, data)
+    data = sensor.sensor_pos(model, data)
+    data = forward.fwd_velocity(model, data)
+    return sensor.sensor_vel(model, data)
+
+
+def _forgets_sensors(data: mjx.Data) -> bool:
+    """`mjx.forward` skips the acceleration sensors of a model without constraints."""
+    return data._impl.efc_J.size == 0
+
+
+def _forward(model: mjx.Model, data: mjx.Data, sensors: bool) -> mjx.Data:
+    """`mjx.forward`, with the acceleration sensors in every case."""
+    data = mjx.forward(model, data)
+    return sensor.sensor_acc(model, data) if sensors and _forgets_sensors(data) else data

@@ -1,0 +1,113 @@
+"""Questions to a `mujoco.MjModel` by name, and the changes that engines want made to one.
+
+Everything that a reward or an observation reads is looked up here once, when the environment is
+built: never by a literal index.
+"""
+
+import difflib
+import hashlib
+from collections.abc import Iterable
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from purerl.core.records import Array
+
+_TYPES = {
+    kind: getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
+    for kind in ("body", "joint", "geom", "site", "sensor", "actuator", "tendon", "camera")
+}
+_COUNTS = {"body": "nbody", "joint": "njnt", "geom": "ngeom", "site": "nsite", "sensor": "nsensor"}
+_COUNTS |= {"actuator": "nu", "tendon": "ntendon", "camera": "ncam"}
+_QPOS_WIDTH = {0: 7, 1: 4, 2: 1, 3: 1}  # by mjtJoint: free, ball, slide, hinge
+_QVEL_WIDTH = {0: 6, 1: 3, 2: 1, 3: 1}
+
+
+def hash_model(model: mujoco.MjModel, rest: tuple = ()) -> str:
+    """Returns a sha256 of a model, all of it, and of the `rest`, as text."""
+    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    return hashlib.sha256(content.tobytes() + repr(rest).encode()).hexdigest()
+
+
+def unknown_name(kind: str, name: str, valid: Iterable[str]) -> str:
+    """The message for a name that is not there: the nearest match, and all there are."""
+    valid = [v for v in valid if v]
+    near = difflib.get_close_matches(str(name), valid, n=1)
+    hint = f" Did you mean {near[0]!r}?" if near else ""
+    return f"There is no {kind} {name!r}.{hint} There are: {', '.join(valid) or 'none'}."
+
+
+def names(model: mujoco.MjModel, kind: str) -> list[str]:
+    """Returns the names of all objects of a kind ("body", "joint", "sensor", ...), by id."""
+    number = getattr(model, _COUNTS[kind])
+    return [mujoco.mj_id2name(model, _TYPES[kind], i) or "" for i in range(number)]
+
+
+def find(model: mujoco.MjModel, kind: str, name: str) -> int:
+    """Returns the id of an object.
+
+    Args:
+      model: the model.
+      kind: "body", "joint", "geom", "site", "sensor", "actuator", "tendon" or "camera".
+      name: its full name, scopes included ("walker/torso").
+
+    Raises:
+      ValueError: there is none of that name; the message lists those there are.
+    """
+    if kind not in _TYPES:
+        raise ValueError(unknown_name("kind of object", kind, _TYPES))
+    found = mujoco.mj_name2id(model, _TYPES[kind], name)
+    if found < 0:
+        raise ValueError(unknown_name(kind, name, names(model, kind)))
+    return found
+
+
+def qpos_indices(model: mujoco.MjModel, joints: Iterable[str]) -> np.ndarray:
+    """Returns where the positions of the joints stand in qpos, in the order given, [n] int."""
+    return _indices(model, joints, model.jnt_qposadr, _QPOS_WIDTH)
+
+
+def qvel_indices(model: mujoco.MjModel, joints: Iterable[str]) -> np.ndarray:
+    """Returns where the velocities of the joints stand in qvel, in the order given, [n] int."""
+    return _indices(model, joints, model.jnt_dofadr, _QVEL_WIDTH)
+
+
+def _indices(model, joints: Iterable[str], starts: np.ndarray, widths: dict) -> np.ndarray:
+    ids = [find(model, "joint", name) for name in joints]
+    ranges = [np.arange(starts[i], starts[i] + widths[int(model.jnt_type[i])]) for i in ids]
+    return np.concatenate([*ranges, np.zeros(0, int)]).astype(int)
+
+
+def sensor_slice(model: mujoco.MjModel, name: str) -> slice:
+    """Returns where the values of a sensor stand in sensordata."""
+    i = find(model, "sensor", name)
+    return slice(int(model.sensor_adr[i]), int(model.sensor_adr[i] + model.sensor_dim[i]))
+
+
+def scale_action(model: mujoco.MjModel, action: Array) -> Array:
+    """Maps an action [nu] in [-1, 1] to controls over each actuator's ctrlrange.
+
+    Raises:
+      ValueError: an actuator has no ctrlrange, so that -1 and 1 mean nothing.
+    """
+    limited = model.actuator_ctrllimited.astype(bool)
+    if not limited.all():
+        open_ended = [n for n, ok in zip(names(model, "actuator"), limited, strict=True) if not ok]
+        raise ValueError(
+            f"Actuators without a ctrlrange: {', '.join(open_ended)}. Give them one, so that an "
+            "action in [-1, 1] has a meaning."
+        )
+    low, high = jnp.asarray(model.actuator_ctrlrange, jnp.float32).T
+    return low + 0.5 * (action + 1.0) * (high - low)
+
+
+def limit_solver(model: mujoco.MjModel, iterations: int, line_search: int) -> None:
+    """Bounds Newton's iterations.
+
+    MJX runs each iteration in lockstep for the whole batch, so the slowest environment sets the
+    time of all; MuJoCo's C code stops each simulation when it has converged.
+    """
+    model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    model.opt.iterations, model.opt.ls_iterations = iterations, line_search

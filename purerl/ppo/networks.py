@@ -1,0 +1,248 @@
+"""Policy and value networks: the default MLP, recurrent ones, and an adapter for any Flax module.
+
+`ppo.py` knows only `Network(init, apply)`; this is the one module that imports a network library.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from purerl.core.records import Array, Network, Normal, PolicyOutput, PyTree
+
+ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
+    "elu": nn.elu,
+    "relu": nn.relu,
+    "swish": nn.swish,
+    "tanh": nn.tanh,
+}
+MIN_SCALE = 1e-3  # a policy of scale 0 has an infinite density
+
+
+@dataclass(frozen=True)
+class MlpOptions:
+    """Sizes of the default feed-forward network."""
+
+    policy_hidden: tuple[int, ...] = (128, 128)
+    """Widths of the policy's hidden layers."""
+    value_hidden: tuple[int, ...] = (256, 256)
+    """Widths of the value function's hidden layers."""
+    activation: Literal["elu", "relu", "swish", "tanh"] = "swish"
+    """Nonlinearity of the hidden layers."""
+    std: Literal["learned", "state"] = "learned"
+    """Policy scale: one learned vector, or a function of the observation."""
+    initial_std: float = 0.6
+    """Policy scale before training, in raw-action units."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a scale that is none."""
+        _check_std(self.initial_std)
+
+
+@dataclass(frozen=True)
+class RecurrentOptions:
+    """Sizes of the recurrent network."""
+
+    cell: Literal["gru", "lstm"] = "gru"
+    """Kind of recurrent cell."""
+    hidden: int = 128
+    """Features of the cell's memory."""
+    encoder: tuple[int, ...] = (128,)
+    """Widths of the layers before the cell."""
+    value_hidden: tuple[int, ...] = (128,)
+    """Widths of the value function's hidden layers, after the cell."""
+    activation: Literal["elu", "relu", "swish", "tanh"] = "swish"
+    """Nonlinearity of the feed-forward layers."""
+    std: Literal["learned", "state"] = "learned"
+    """Policy scale: one learned vector, or a function of the observation."""
+    initial_std: float = 0.6
+    """Policy scale before training, in raw-action units."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a scale that is none."""
+        _check_std(self.initial_std)
+
+
+def _check_std(initial_std: float) -> None:
+    if not MIN_SCALE <= initial_std <= 100.0:
+        raise ValueError(f"initial_std is {initial_std}; it must be from {MIN_SCALE} to 100.")
+
+
+def check_observation(observation: PyTree) -> None:
+    """Raises ValueError unless an observation is an array [O], or a flat dict of such."""
+    parts = observation if isinstance(observation, dict) else {"policy": observation}
+    if "policy" not in parts:
+        raise ValueError(
+            f"The observation is a dict of {', '.join(sorted(parts))}; the entry that the policy "
+            "may read must be called policy (the value function reads all)."
+        )
+    for name, part in parts.items():
+        if getattr(part, "ndim", None) != 1:
+            what = (
+                f"of shape {part.shape}" if hasattr(part, "shape") else f"a {type(part).__name__}"
+            )
+            raise ValueError(
+                f"The observation's part {name} is {what}; this network takes arrays [O]: flatten "
+                "it, or write a network of your own (experiments/custom_network.py)."
+            )
+
+
+def check_network(network: Network, observation: PyTree, action_size: int) -> None:
+    """Raises ValueError unless a network's answers have the shapes that the trainer reads.
+
+    Args:
+      network: the network; nothing is computed.
+      observation: an example, leaves [O].
+      action_size: A.
+    """
+    params, carry = jax.eval_shape(network.init, jax.random.key(0))
+    batch = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((2, *x.shape), x.dtype), (observation, carry)
+    )
+    output, following = jax.eval_shape(network.apply, params, *batch)
+    scalar, action = (2,), (2, action_size)
+    normal = output.distribution
+    answers = [("loc", normal.loc, action), ("scale", normal.scale, action)]
+    for name, answer, shape in [*answers, ("value", output.value, scalar)]:
+        if answer.shape != shape:
+            raise ValueError(
+                f"The network's {name} is {list(answer.shape)} for 2 observations and "
+                f"{action_size} actions; it must be {list(shape)}."
+            )
+    kinds = [jax.tree.map(lambda x: (x.shape, x.dtype), tree) for tree in (batch[1], following)]
+    if kinds[0] != kinds[1]:
+        raise ValueError(
+            f"The network's memory goes in as {kinds[0]} and comes back as {kinds[1]}, for 2 "
+            "environments; `apply` must return it as it was given, and `init` one environment's."
+        )
+
+
+def policy_features(observation: PyTree) -> Array:
+    """Returns what the policy may read, [..., O]: the array, or the entry "policy" of a dict."""
+    return observation["policy"] if isinstance(observation, dict) else observation
+
+
+def value_features(observation: PyTree) -> Array:
+    """Returns what the value function may read, [..., O]: every entry of a dict, in name order."""
+    if not isinstance(observation, dict):
+        return observation
+    return jnp.concatenate([observation[name] for name in sorted(observation)], axis=-1)
+
+
+def _inverse_softplus(x: float) -> float:
+    return math.log(math.expm1(x))
+
+
+class Stack(nn.Module):
+    """Dense layers with an activation after each."""
+
+    widths: tuple[int, ...]
+    activation: str
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        """Returns [..., last width]."""
+        for width in self.widths:
+            x = ACTIVATIONS[self.activation](nn.Dense(width)(x))
+        return x
+
+
+class GaussianHead(nn.Module):
+    """Features [..., H] to a Gaussian over raw actions [..., A]; starts near mean 0."""
+
+    action_size: int
+    std: str
+    initial_std: float
+
+    @nn.compact
+    def __call__(self, x: Array) -> Normal:
+        """Returns the Gaussian of features [..., H]."""
+        # Nearly zero weights: the first policy explores alike everywhere.
+        small = nn.initializers.variance_scaling(1e-4, "fan_in", "truncated_normal")
+        loc = nn.Dense(self.action_size, kernel_init=small, name="loc")(x)
+        if self.std == "state":
+            raw = nn.Dense(self.action_size, kernel_init=small, name="scale")(x)
+        else:
+            raw = self.param("scale", nn.initializers.zeros, (self.action_size,))
+        offset = _inverse_softplus(self.initial_std)
+        scale = jax.nn.softplus(raw + offset) + MIN_SCALE
+        return Normal(loc=loc, scale=jnp.broadcast_to(scale, loc.shape))
+
+
+class MlpActorCritic(nn.Module):
+    """Separate policy and value towers: they share no weights."""
+
+    options: MlpOptions
+    action_size: int
+
+    @nn.compact
+    def __call__(self, observation: PyTree) -> PolicyOutput:
+        """Applies both towers to observations, leaves [..., O]."""
+        o = self.options
+        policy = Stack(o.policy_hidden, o.activation, name="policy")(policy_features(observation))
+        normal = GaussianHead(self.action_size, o.std, o.initial_std, name="head")(policy)
+        value = Stack(o.value_hidden, o.activation, name="value")(value_features(observation))
+        return PolicyOutput(normal, nn.Dense(1, name="value_out")(value)[..., 0])
+
+
+class RecurrentActorCritic(nn.Module):
+    """A cell over what the policy may read; the value also reads the rest of the observation."""
+
+    options: RecurrentOptions
+    action_size: int
+
+    @nn.compact
+    def __call__(self, observation: PyTree, carry: PyTree) -> tuple[PolicyOutput, PyTree]:
+        """Moves the memory [..., H] on by one observation, and answers from it."""
+        o = self.options
+        encoded = Stack(o.encoder, o.activation, name="encoder")(policy_features(observation))
+        cell = {"gru": nn.GRUCell, "lstm": nn.OptimizedLSTMCell}[o.cell](o.hidden, name="cell")
+        carry, memory = cell(carry, encoded)
+        normal = GaussianHead(self.action_size, o.std, o.initial_std, name="head")(memory)
+        features = jnp.concatenate([memory, value_features(observation)], axis=-1)
+        value = Stack(o.value_hidden, o.activation, name="value")(features)
+        return PolicyOutput(normal, nn.Dense(1, name="value_out")(value)[..., 0]), carry
+
+
+def from_linen(module: nn.Module, observation: PyTree, carry: PyTree = ()) -> Network:
+    """Adapts a Flax module to `Network`.
+
+    Args:
+      module: `module(observation) -> PolicyOutput`, or, with a carry,
+        `module(observation, carry) -> (PolicyOutput, carry)`. Leading axes are batch axes.
+      observation: an example of one observation, leaves [O] (shapes only matter).
+      carry: one environment's memory at the start of an episode, leaves [H], all zeros.
+    """
+    recurrent = len(jax.tree.leaves(carry)) > 0
+    if any(jnp.any(x != 0) for x in jax.tree.leaves(carry)):
+        raise ValueError("A memory starts an episode at zero; this carry has other numbers in it.")
+    arguments = (observation, carry) if recurrent else (observation,)
+
+    def init(key: Array) -> tuple[PyTree, PyTree]:
+        return module.init(key, *arguments), carry
+
+    def apply(params: PyTree, observation: PyTree, carry: PyTree) -> tuple[PolicyOutput, PyTree]:
+        if recurrent:
+            return module.apply(params, observation, carry)
+        output: Any = module.apply(params, observation)
+        return output, carry
+
+    return Network(init=init, apply=apply)
+
+
+def mlp(options: MlpOptions, observation: PyTree, action_size: int) -> Network:
+    """Builds the default network for one `observation` (leaves [O]) and `action_size` A."""
+    check_observation(observation)
+    return from_linen(MlpActorCritic(options, action_size), observation)
+
+
+def recurrent(options: RecurrentOptions, observation: PyTree, action_size: int) -> Network:
+    """Builds the GRU or LSTM network for one `observation` (leaves [O]) and `action_size` A."""
+    check_observation(observation)
+    memory = jnp.zeros(options.hidden)
+    carry = memory if options.cell == "gru" else (memory, memory)
+    return from_linen(RecurrentActorCritic(options, action_size), observation, carry)

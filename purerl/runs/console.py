@@ -1,0 +1,147 @@
+"""What a person sees of a run: the plan, a live bar on a terminal, plain lines elsewhere."""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from purerl.runs.build_experiment import Setup
+from purerl.runs.loggers import Record
+from purerl.runs.loop import Plan
+from purerl.core.records import PyTree
+
+SECONDS_BETWEEN_LINES = 2.0
+# Or one would think that it hangs.
+SLOW_BEGINNINGS = {"warp": "; its kernels, once on a machine, take a minute or more of an update"}
+
+
+def describe_plan(
+    plan: Plan, setup: Setup, abstract: PyTree, facts: dict[str, Any], runs: list[Path], cache: str
+) -> list[str]:
+    """Returns every derived number of a run, as lines, before anything heavy starts."""
+    left = setup.config.num_steps - plan.steps
+    rounded = f", {left:,} fewer than num_steps: whole updates only" if left else ""
+    device = facts["device"]
+    return [
+        f"run          {runs[0]}",
+        *_seeds(runs, facts),
+        f"updates      {plan.updates:,} of {plan.steps_per_update:,} steps",
+        f"steps        {plan.steps:,}{rounded}",
+        f"evaluations  {_ticks(plan.evaluations)}",
+        f"checkpoints  {_ticks(plan.checkpoints)}",
+        f"metrics      a line every {plan.log_every} updates",
+        f"parameters   {count(abstract.params):,}",
+        f"state        {size(abstract) / 1e6:,.1f} MB",
+        f"engine       {setup.engine}{SLOW_BEGINNINGS.get(setup.engine, '')}",
+        *_shards(setup, facts),
+        f"device       {facts['devices']} x {device['kind']} ({device['platform']})",
+        f"cache        {cache}",
+        f"bit-exact    {_exactness(facts)}",
+    ]
+
+
+def _exactness(facts: dict[str, Any]) -> str:
+    return "yes" if facts["bit_exact"] else f"no: {'; '.join(facts['inexact_because'])}"
+
+
+def _shards(setup: Setup, facts: dict[str, Any]) -> list[str]:
+    number, devices = facts["num_shards"], facts["devices"]
+    if number == 1:
+        return []
+    each = f"{setup.config.num_envs // number} environments each, {number // devices} on a device"
+    return [f"shards       {number}, {each}"]
+
+
+def _seeds(runs: list[Path], facts: dict[str, Any]) -> list[str]:
+    if len(runs) == 1:
+        return []
+    how = "one after another: the bits of single runs"
+    if "vmapped_seeds" in facts:
+        how = "vmapped: the statistics of single runs, other bits"
+    return [f"seeds        {len(runs)}, to {runs[-1].name}, {how}"]
+
+
+def _ticks(updates: tuple[int, ...]) -> str:
+    return f"{len(updates)}, the first after update {updates[0]:,}" if updates else "none"
+
+
+def count(tree: PyTree) -> int:
+    """Returns the number of numbers in a tree."""
+    return sum(leaf.size for leaf in jax.tree.leaves(tree))
+
+
+def size(tree: PyTree) -> int:
+    """Returns the bytes of a tree's arrays; of abstract ones too."""
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+
+
+class Lines:
+    """Progress as plain lines, for logs and pipes."""
+
+    def __init__(self, updates: int) -> None:
+        """Shows how far of `updates` a run is."""
+        self.updates = updates
+        self.shown = 0.0  # when, by the monotonic clock [s]
+
+    def say(self, line: str) -> None:
+        """Prints a line."""
+        print(line, flush=True)
+
+    def show(self, record: Record, seconds_left: float, steps_per_second: float) -> None:
+        """Prints a line for a chunk, unless one has just been printed."""
+        now = time.monotonic()
+        last = record["update"] >= self.updates
+        if now - self.shown < SECONDS_BETWEEN_LINES and not last:
+            return
+        self.shown = now
+        self.say(
+            f"update {record['update']}/{self.updates}  "
+            + figures(record, seconds_left, steps_per_second)
+        )
+
+
+def figures(record: Record, seconds_left: float, steps_per_second: float) -> str:
+    """Returns a chunk's figures as a person reads them."""
+    value = record.get("train/episode_return")
+    shown = "-" if value is None else f"{value:.2f}"
+    minutes, seconds = divmod(round(seconds_left), 60)
+    left = f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"
+    lost = record.get("train/nonfinite_resets")
+    warning = f"  {lost:,.0f} episodes lost (NaN, or absurd)" if lost else ""
+    rate = f"{steps_per_second:,.0f} steps/s"
+    return f"steps {record['steps']:,}  return {shown}{warning}  {rate}  left {left}"
+
+
+class Bar:
+    """Progress as a live bar, for a terminal."""
+
+    def __init__(self, updates: int, bar: Any) -> None:
+        """Drives a `rich` progress display."""
+        self.bar = bar
+        self.task = bar.add_task("", total=updates)
+
+    def say(self, line: str) -> None:
+        """Prints a line above the bar."""
+        self.bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    def show(self, record: Record, seconds_left: float, steps_per_second: float) -> None:
+        """Moves the bar."""
+        text = figures(record, seconds_left, steps_per_second)
+        self.bar.update(self.task, completed=record["update"], description=text)
+
+
+@contextmanager
+def progress(updates: int) -> Iterator[Lines | Bar]:
+    """Yields a live bar where standard output is a terminal, plain lines elsewhere."""
+    if not sys.stdout.isatty():
+        yield Lines(updates)
+        return
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+    columns = (BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"))
+    with Progress(*columns) as bar:
+        yield Bar(updates, bar)

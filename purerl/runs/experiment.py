@@ -1,0 +1,285 @@
+"""Experiments: builder functions and the data they are called with, in one file a person copies.
+
+This module imports nothing heavy, so that a list of experiments or a help page comes at once.
+"""
+
+import ast
+import contextlib
+import dataclasses
+import enum
+import importlib
+import importlib.util
+import re
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+
+import tyro
+
+import purerl
+
+from purerl.core.errors import UserError, one_line, unknown
+
+if TYPE_CHECKING:
+    from purerl.ppo.config import Config
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """When and how the policy is evaluated during training; never changes training by a bit."""
+
+    num_episodes: int = 32
+    """Whole episodes in each evaluation."""
+    number: int = 10
+    """Evaluations over the run, evenly spaced, the last one at the end; 0: none."""
+
+    def __post_init__(self) -> None:
+        """Checks the rules."""
+        if self.num_episodes < 1:
+            raise ValueError(f"num_episodes is {self.num_episodes}; it must be at least 1.")
+        if self.number < 0:
+            raise ValueError(f"number is {self.number}; it must be at least 0.")
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What is trained and how: builders (functions) and settings (frozen dataclasses).
+
+    `build_env(env, engine) -> Env` and `build_network(network, observation, action_size) ->
+    Network`, where `observation` is one environment's, zeros of the right shapes. Every setting can
+    be overridden on the command line: `--ppo.learning-rate 1e-3 --env.forward-weight 2`.
+    """
+
+    build_env: Callable[[Any, str], Any]
+    env: Any
+    build_network: Callable[[Any, Any, int], Any]
+    network: Any
+    ppo: "Config"
+    seed: Annotated[int, tyro.conf.arg(help="Seed of everything random in the run.")] = 1
+    engine: Annotated[
+        Literal["auto", "c", "jax", "warp"],
+        tyro.conf.arg(
+            help="Physics engine; auto: c (MuJoCo's C code) where JAX is on a CPU, else jax (MJX)."
+        ),
+    ] = "auto"
+    evaluation: Evaluation = Evaluation()
+
+
+BUILDERS = ("build_env", "build_network")
+
+
+class Source(NamedTuple):
+    """An experiment and where it came from."""
+
+    experiment: Experiment
+    name: str  # names the folder under runs/
+    path: Path
+
+
+# --- finding ---
+
+
+def folders() -> list[Path]:
+    """Returns where named experiments are looked for: here, then beside the library."""
+    places = [Path.cwd() / "experiments", Path(purerl.__file__).parent.parent / "experiments"]
+    return [place for place in dict.fromkeys(places) if place.is_dir()]
+
+
+def available() -> dict[str, Path]:
+    """Returns the named experiments, name -> file; the first folder wins.
+
+    Scripts stand beside them: an experiment is a file that gives its `experiment` a value.
+    """
+    files = [file for folder in reversed(folders()) for file in sorted(folder.glob("*.py"))]
+    gives = re.compile(r"^experiment(: *Experiment)? = ", re.MULTILINE)
+    return {file.stem: file for file in files if gives.search(file.read_text())}
+
+
+def summary(path: Path) -> str:
+    """Returns the first line of a file's docstring, without running the file."""
+    try:
+        text = ast.get_docstring(ast.parse(path.read_text()))
+    except (OSError, SyntaxError):
+        text = None
+    return text.splitlines()[0] if text else ""
+
+
+def find(name: str) -> Source:
+    """Loads an experiment by name in experiments/, path of a Python file, or dotted module."""
+    named = available()
+    if name.endswith(".py") or "/" in name:
+        path = Path(name)
+        if not path.is_file():
+            raise UserError(f"There is no experiment file {name}.")
+        return load(path)
+    if name in named:
+        return load(named[name])
+    if "." in name:
+        return _from_module(name)
+    raise unknown("experiment", name, named, f" in {' or '.join(map(str, folders())) or 'sight'}")
+
+
+def load(path: Path, name: str = "", copy_of: Path | None = None) -> Source:
+    """Loads the experiment that a Python file defines as `experiment = Experiment(...)`.
+
+    Args:
+      path: the file.
+      name: the experiment's, if that is not the file's.
+      copy_of: the file that it is a copy of. Where that still exists it is its `__file__`: what
+        the experiment reads stands beside it.
+    """
+    path = path.resolve()
+    module_name = f"purerl_experiment_{path.stem}"
+    # A file of a package, imported under its own name, so that its source counts as the package's.
+    if (path.parent / "__init__.py").exists() and str(path.parent.parent) in sys.path:
+        module_name = f"{path.parent.name}.{path.stem}"
+    place = copy_of if copy_of is not None and copy_of.is_file() else path
+    return _checked(_execute(module_name, path, place), name or path.stem, path)
+
+
+def _execute(module_name: str, path: Path, place: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    assert spec is not None and spec.loader is not None  # it is an existing .py file
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[module_name] = module  # dataclasses and help texts look their module up
+    module.__file__ = str(place)
+    with _mistakes(str(path), place):
+        spec.loader.exec_module(module)
+    return module
+
+
+@contextlib.contextmanager
+def _mistakes(file: str, place: Path) -> Iterator[None]:
+    """Turns an error in a person's own file into one line with the line that they need to see.
+
+    `place` is where the file's modules stand: a run has a copy of it alone.
+    """
+    try:
+        yield
+    except SyntaxError as error:
+        raise UserError(f"{error.filename}, line {error.lineno}: {error.msg}.") from error
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        lines = [frame.lineno for frame in frames if frame.filename == file]
+        where = f", line {lines[-1]}" if lines else ""
+        raise UserError(f"{file}{where}: {one_line(error)}{_hint(place, error)}") from error
+
+
+def _hint(file: Path, error: Exception) -> str:
+    """Returns what to do about a module that stands beside the file that imports it."""
+    beside = file.parent
+    if isinstance(error, ModuleNotFoundError) and error.name:
+        place = beside / error.name.partition(".")[0]
+        if place.is_dir() or place.with_suffix(".py").exists():
+            return f"; it stands beside the file: set PYTHONPATH={beside}"
+    return ""
+
+
+def _from_module(name: str) -> Source:
+    try:
+        spec = importlib.util.find_spec(name)
+    except (ImportError, ValueError):
+        spec = None
+    if spec is None or spec.origin is None:
+        raise unknown("experiment", name, available())
+    path = Path(spec.origin)
+    with _mistakes(spec.origin, path):
+        module = importlib.import_module(name)
+        nodes = list(ast.walk(ast.parse(path.read_text())))
+    if any(isinstance(node, ast.ImportFrom) and node.level for node in nodes):
+        raise UserError(
+            f"{path} imports relatively (from . import ...), and a run keeps a copy of the file "
+            "that has to work alone: import by the full name."
+        )
+    return _checked(module, name.rpartition(".")[2], path)
+
+
+def _checked(module: ModuleType, name: str, path: Path) -> Source:
+    found = getattr(module, "experiment", None)
+    if not isinstance(found, Experiment):
+        raise UserError(f"{path} defines no `experiment = Experiment(...)` (it is {found!r}).")
+    for field in ("env", "network", "ppo", "evaluation"):
+        value = getattr(found, field)
+        if not dataclasses.is_dataclass(value) or isinstance(value, type):
+            raise UserError(f"{path}: {field} is {value!r}; it must be a frozen dataclass's value.")
+    return Source(found, name, path)
+
+
+# --- settings as JSON ---
+
+
+def settings(experiment: Experiment) -> dict[str, Any]:
+    """Returns everything of an experiment but its builders, by field name."""
+    return {
+        field.name: getattr(experiment, field.name)
+        for field in dataclasses.fields(experiment)
+        if field.name not in BUILDERS
+    }
+
+
+def to_json(value: Any, path: str = "") -> Any:
+    """Turns settings into JSON values; UserError names a field that JSON cannot hold."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
+        value = {k: v for k, v in value.items() if k not in BUILDERS}
+    if isinstance(value, enum.Enum):
+        return value.name
+    if isinstance(value, dict) and all(isinstance(key, str) for key in value):
+        return {key: to_json(v, f"{path}.{key}" if path else key) for key, v in value.items()}
+    if isinstance(value, tuple | list):
+        return [to_json(v, f"{path}[{i}]") for i, v in enumerate(value)]
+    if isinstance(value, Path):
+        return str(value)
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise UserError(
+        f"{path} is a {type(value).__name__}, which config.json cannot hold. Settings are numbers, "
+        "strings, None, and tuples, dicts and dataclasses of them; build the rest in build_env."
+    )
+
+
+def from_json(template: Any, values: Any, path: str = "") -> Any:
+    """Returns `template` with JSON values in place of its own, the inverse of `to_json`.
+
+    Raises:
+      UserError: a field is missing or unknown: the code is not the one that wrote the values.
+    """
+    if dataclasses.is_dataclass(template) and not isinstance(template, type):
+        names = [f.name for f in dataclasses.fields(template) if f.init and f.name not in BUILDERS]
+        _check_names(names, values, path)
+        read = {n: from_json(getattr(template, n), values[n], _join(path, n)) for n in names}
+        try:
+            return dataclasses.replace(template, **read)
+        except ValueError as error:
+            raise UserError(f"{path or 'experiment'}: {error}") from error
+    if isinstance(template, enum.Enum):
+        return type(template)[values]
+    if isinstance(template, Path):
+        return Path(values)
+    if isinstance(values, dict):
+        known = template if isinstance(template, dict) else {}
+        return {k: from_json(known.get(k), v, _join(path, k)) for k, v in values.items()}
+    if isinstance(values, list):
+        like = list(template) if isinstance(template, list | tuple) and template else [None]
+        like += like[-1:] * (len(values) - len(like))  # what is longer goes on like the last
+        inner = [from_json(t, v, f"{path}[]") for t, v in zip(like, values, strict=False)]
+        return inner if isinstance(template, list) else tuple(inner)
+    return values
+
+
+def _join(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else name
+
+
+def _check_names(names: list[str], values: Any, path: str) -> None:
+    if not isinstance(values, dict):
+        raise UserError(f"The settings of {path} are {values!r}; they must be {{name: value}}.")
+    for name in sorted({*names, *values}):
+        if name not in values:
+            raise UserError(f"config.json lacks {_join(path, name)}, which the experiment has.")
+        if name not in names:
+            raise unknown("setting", _join(path, name), [_join(path, n) for n in names])

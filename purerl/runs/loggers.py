@@ -1,0 +1,204 @@
+"""What a run tells: metrics.jsonl, which is part of the run, and loggers, which are not.
+
+metrics.jsonl is exact: resumed or not, it holds the same lines. TensorBoard and W&B live in
+threads of their own behind bounded queues; one that raises or cannot keep up is dropped, once and
+aloud, and training never waits for it.
+"""
+
+import json
+import math
+import queue
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from purerl.core.errors import UserError, one_line
+
+Record = dict[str, Any]
+Say = Callable[[str], None]
+
+COUNTS = ("episodes", "nonfinite_resets", "replayed_resets", "reused_resets", "skipped_minibatches")
+
+
+def summarize(window: Sequence[Mapping[str, Any]]) -> Record:
+    """Joins the metrics of several updates: counts are summed, the rest averaged.
+
+    What is known of ended episodes (`episode...`) is averaged over episodes, not over updates, and
+    None where none ended.
+    """
+    episodes = sum(float(metrics["episodes"]) for metrics in window)
+    record: Record = {}
+    for name in window[0]:
+        values = [float(metrics[name]) for metrics in window]
+        if name in COUNTS:
+            record[name] = sum(values)
+        elif name == "skipped_in_a_row":
+            record[name] = values[-1]
+        elif name.startswith("episode"):
+            # An update without an ended episode has nothing to say: not 0, and not NaN.
+            counts = [float(metrics["episodes"]) for metrics in window]
+            weighted = sum(v * n for v, n in zip(values, counts, strict=True) if n)
+            record[name] = weighted / episodes if episodes else None
+        else:
+            record[name] = sum(values) / len(values)
+    return record
+
+
+def finite_or_none(value: Any) -> Any:
+    """Returns NaN and infinities as None: JSON has no such numbers."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+class MetricsFile:
+    """metrics.jsonl: whole lines, appended and flushed, cut back to where a checkpoint was taken.
+
+    A line that the disk refuses is kept and written with the next one, so that a disk that was full
+    for a while leaves no gap.
+    """
+
+    def __init__(self, path: Path, offset: int) -> None:
+        """Opens the file and forgets everything after `offset` [bytes]."""
+        self.file = path.open("ab", buffering=0)
+        if self.file.tell() < offset:
+            raise UserError(
+                f"{path} has {self.file.tell()} bytes, but the checkpoint was taken after "
+                f"{offset}: it has been cut or replaced. Start another run with --name."
+            )
+        self.file.truncate(offset)
+        self.offset = offset
+        self.pending = b""
+
+    def append(self, record: Record) -> int:
+        """Writes one line; returns the file's length after it [bytes]. OSError: not written yet."""
+        clean = {name: finite_or_none(value) for name, value in record.items()}
+        self.pending += json.dumps(clean, allow_nan=False).encode() + b"\n"
+        try:
+            written = self.file.write(self.pending)
+            if written != len(self.pending):
+                raise OSError(f"only {written} of {len(self.pending)} bytes were written")
+        except OSError:
+            self.file.truncate(self.offset)
+            raise
+        self.offset += len(self.pending)
+        self.pending = b""
+        return self.offset
+
+    def close(self) -> None:
+        """Closes the file."""
+        self.file.close()
+
+
+class Sink(Protocol):
+    """Where a logger's records go."""
+
+    def log(self, record: Record) -> None:
+        """Takes one record."""
+        ...
+
+    def close(self) -> None:
+        """Flushes."""
+        ...
+
+
+class BackgroundLogger:
+    """A sink in a thread of its own; dropped, with one message, when it raises or lags."""
+
+    def __init__(self, name: str, open_sink: Callable[[], Sink], say: Say, size: int = 256) -> None:
+        """Opens the sink in the thread; `size` records may wait before it counts as too slow."""
+        self.name, self.say = name, say
+        self.queue: queue.Queue[Record | None] = queue.Queue(size)
+        self.dropped = threading.Event()
+        self.thread = threading.Thread(target=self._work, args=(open_sink,), daemon=True)
+        self.thread.start()
+
+    def log(self, record: Record) -> None:
+        """Hands a record over; never waits."""
+        if self.dropped.is_set():
+            return
+        try:
+            self.queue.put_nowait(record)
+        except queue.Full:
+            self._drop(f"it is too slow ({self.queue.maxsize} records wait)")
+
+    def close(self, timeout: float = 20.0) -> None:
+        """Lets what waits be written, for at most `timeout` [s]."""
+        if self.dropped.is_set():
+            return
+        try:
+            self.queue.put(None, timeout=timeout)
+        except queue.Full:
+            self._drop("it is too slow to finish")
+            return
+        self.thread.join(timeout)
+        if self.thread.is_alive():
+            self._drop(f"it did not finish within {timeout:g} s")
+
+    def _work(self, open_sink: Callable[[], Sink]) -> None:
+        try:
+            sink = open_sink()
+            while (record := self.queue.get()) is not None and not self.dropped.is_set():
+                sink.log(record)
+            sink.close()
+        except BaseException as error:  # whatever a logger does, training goes on
+            self._drop(one_line(error))
+
+    def _drop(self, reason: str) -> None:
+        if not self.dropped.is_set():
+            self.dropped.set()
+            self.say(f"The {self.name} logger is dropped: {reason}. Training goes on.")
+
+
+class TensorBoardSink:
+    """Writes scalars for TensorBoard under the run's folder."""
+
+    def __init__(self, folder: Path, update: int) -> None:
+        """Opens a writer that hides what an earlier life of the run wrote after `update`."""
+        from tensorboardX import SummaryWriter
+
+        self.writer = SummaryWriter(str(folder / "tensorboard"), purge_step=update + 1)
+
+    def log(self, record: Record) -> None:
+        """Writes every number of a record, at its update."""
+        for name, value in record.items():
+            if isinstance(value, float) and math.isfinite(value):
+                self.writer.add_scalar(name, value, record["update"])
+
+    def close(self) -> None:
+        """Flushes and closes."""
+        self.writer.close()
+
+
+class WandbSink:
+    """Sends records to Weights & Biases; a resumed run goes on under the same id."""
+
+    def __init__(self, folder: Path, mode: Any, project: str, run_id: str, config: Record) -> None:
+        """Starts or continues the W&B run; its files go under the run's folder."""
+        import wandb
+
+        name = "/".join(folder.absolute().parts[-2:])
+        self.run = wandb.init(
+            project=project, id=run_id, resume="allow", mode=mode, dir=str(folder), name=name,
+            config=config, settings=wandb.Settings(console="off"),
+            reinit="create_new",  # several seeds in one process are several W&B runs
+        )  # fmt: skip
+        self.run.define_metric("update")
+        self.run.define_metric("*", step_metric="update")
+
+    def log(self, record: Record) -> None:
+        """Sends one record."""
+        self.run.log(record)
+
+    def close(self) -> None:
+        """Finishes the upload."""
+        self.run.finish()
+
+
+def check_installed(package: str, extra: str) -> None:
+    """Raises UserError, with the line to paste, unless a logger's package is there."""
+    import importlib.util
+
+    if importlib.util.find_spec(package) is None:
+        raise UserError(
+            f"The package {package} is not installed; run: pip install 'purerl[{extra}]'"
+        )

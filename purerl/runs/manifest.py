@@ -1,0 +1,274 @@
+"""What a run depends on besides its settings: versions, device, flags, source.
+
+The same settings give the same bits only under the same manifest, so it is written down at the
+start, compared on resuming, and its fingerprint stands in every checkpoint.
+"""
+
+import ast
+import functools
+import hashlib
+import importlib.util
+import json
+import os
+import platform
+import subprocess
+import sys
+import sysconfig
+from collections.abc import Callable, Iterable
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+PACKAGES = ["jax", "jaxlib", "mujoco", "mujoco-mjx", "dm-control", "flax", "optax", "numpy"]
+PACKAGES += ["orbax-checkpoint"]
+INFORMATIVE = {"run_id", "name", "git_revision", "git_dirty", "allowed_changes"}
+INFORMATIVE |= {"devices"}  # how many share the shards
+INFORMATIVE |= {"experiment_file"}  # its text is compared itself
+INFORMATIVE |= {"bit_exact", "inexact_because"}  # what they follow from is compared itself
+FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE", "JAX_PLATFORMS", "JAX_ENABLE_X64")
+
+
+def collect(
+    engine: str, builders: Iterable[Callable], kernels: str = "fixed", num_shards: int = 1
+) -> dict[str, Any]:
+    """Describes this process: all that decides a run's bits apart from the run's own settings.
+
+    Args:
+      engine: the physics engine in use, resolved ("auto" is not an answer).
+      builders: functions whose source folders are part of the run (build_env, build_network).
+      kernels: `kernels.how_chosen`.
+      num_shards: V; on how many devices share them the bits do not depend.
+    """
+    import jax
+
+    packages = PACKAGES + (["warp-lang"] if engine == "warp" else [])
+    device = jax.devices()[0]
+    about = {
+        "platform": device.platform,
+        "kind": _device_kind(device),
+    }
+    if device.platform == "cpu":  # XLA's pool size changes the bits of matrix products on a CPU
+        about["threads"] = max(cpu_threads(), jax.local_device_count())
+    options = jax.config.values
+    return (
+        {
+            "versions": {"python": platform.python_version()} | {p: _version(p) for p in packages},
+            "device": about,
+            "num_shards": num_shards,
+            "devices": jax.device_count() if num_shards > 1 else 1,
+            "engine": engine,
+            "kernels": kernels,
+            "matmul_precision": options["jax_default_matmul_precision"] or "default",
+            "x64": options["jax_enable_x64"],
+            "prng": options["jax_default_prng_impl"],
+            "threefry_partitionable": options["jax_threefry_partitionable"],
+            "flags": flags(),
+            "source": source_hashes(builders),
+        }
+        | exactness(inexact_because(engine, kernels))
+        | _git(Path(__file__).parent)
+    )
+
+
+def inexact_because(engine: str, kernels: str, unordered: Iterable[str] = ()) -> list[str]:
+    """Lists what keeps two runs of one manifest from having the same bits; empty: nothing does.
+
+    Args:
+      engine: the physics engine.
+      kernels: `kernels.how_chosen`.
+      unordered: places of sums, in a program for a GPU, whose order nothing fixes.
+    """
+    reasons = [f"a sum without a fixed order: {place}" for place in unordered]
+    if engine == "warp":
+        reasons.append("engine warp: MJX-Warp adds with atomics, in any order")
+    if kernels == "by timing":
+        reasons.append(
+            "XLA chooses kernels by timing, anew in each process: leave xla_gpu_autotune_level out "
+            "of XLA_FLAGS, or set it to 0"
+        )
+    return reasons
+
+
+def exactness(reasons: list[str]) -> dict[str, Any]:
+    """Returns what manifest.json says of a run's exactness."""
+    return {"bit_exact": not reasons, "inexact_because": reasons}
+
+
+def flags() -> dict[str, str]:
+    """Returns the environment variables that bits depend on, without what says how many devices."""
+    found = {name: os.environ[name] for name in FLAGS if name in os.environ}
+    if "XLA_FLAGS" in found:
+        words = found["XLA_FLAGS"].split()
+        found["XLA_FLAGS"] = " ".join(w for w in words if "platform_device_count" not in w)
+    return found
+
+
+def cpu_threads() -> int:
+    """Returns the size of XLA's CPU thread pool: NPROC where it is set, else the usable cores."""
+    pinned = os.environ.get("NPROC", "") or os.environ.get("PJRT_NPROC", "")
+    return int(pinned) if pinned.isdigit() else len(os.sched_getaffinity(0))
+
+
+def fingerprint(manifest: dict[str, Any]) -> str:
+    """Returns a sha256 over everything in the manifest that can change a run's bits."""
+    relevant = {key: value for key, value in manifest.items() if key not in INFORMATIVE}
+    return hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()
+
+
+def differences(old: Any, new: Any, path: str = "") -> list[str]:
+    """Lists where two JSON values differ, as `path: old -> new`, but for INFORMATIVE keys."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        keys = [key for key in sorted({*old, *new}) if path or key not in INFORMATIVE]
+        missing = "(absent)"
+        return [
+            line
+            for key in keys
+            for line in differences(
+                old.get(key, missing), new.get(key, missing), f"{path}.{key}" if path else key
+            )
+        ]
+    return [] if old == new else [f"{path}: {old} -> {new}"]
+
+
+def source_hashes(builders: Iterable[Callable]) -> dict[str, str]:
+    """Returns a short sha256 of each file of the source that decides a run's bits, by module.
+
+    That is: every Python file that the algorithm and the builders import, but for installed
+    packages, and the bodies (`assets/*.xml`) beside. An edit of a plot or of another environment
+    does not keep a run from resuming.
+    """
+    names = ["purerl.ppo.algorithm", "purerl.ppo.evaluation"]
+    names += [module_of(builder) for builder in builders]
+    files = imported_files(names)
+    folders = {file.parent.parent / "assets" for file in files.values()}
+    bodies = {f"assets/{f.name}": f for folder in folders for f in folder.rglob("*.xml")}
+    # By name, not by place: a moved checkout is the same source.
+    return {
+        name: hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+        for name, file in sorted((files | bodies).items())
+    }
+
+
+def module_of(builder: Callable) -> str:
+    """Returns the module that a function, or what wraps it as a partial, comes from."""
+    while isinstance(builder, functools.partial):
+        builder = builder.func
+    return builder.__module__
+
+
+def imported_files(names: Iterable[str]) -> dict[str, Path]:
+    """Returns module name -> file, of `names` and all they import.
+
+    Other packages' files count unless they are installed: those have a version.
+    """
+    todo = list(names)
+    ours = {name.partition(".")[0]: True for name in todo}
+    installed = installed_folders()
+    found: dict[str, Path] = {}
+    while todo:
+        name = todo.pop()
+        package = name.partition(".")[0]
+        if package not in ours:
+            ours[package] = not _is_within(package, installed)
+        file = module_file(name) if ours[package] and name not in found else None
+        if file is not None and file.suffix == ".py":
+            found[name] = file
+            todo += _imports(file)
+    return found
+
+
+def _is_within(package: str, folders: set[Path]) -> bool:
+    """Tells whether a package is in one of the folders, or nowhere."""
+    file = module_file(package)
+    if file is not None:
+        return not folders.isdisjoint(file.parents)
+    spec = importlib.util.find_spec(package) if package != "__main__" else None
+    places = (spec and spec.submodule_search_locations) or []  # of a package without __init__.py
+    return all(not folders.isdisjoint(Path(place).absolute().parents) for place in places)
+
+
+def installed_folders() -> set[Path]:
+    """Returns where Python and installed packages are: beside a package there is its metadata."""
+    places = {Path(place).absolute() for place in sys.path}
+    return {*filter(_holds_packages, places), Path(sysconfig.get_path("stdlib"))}
+
+
+def _holds_packages(folder: Path) -> bool:
+    try:
+        return any(name.endswith(".dist-info") for name in os.listdir(folder))
+    except PermissionError:  # whatever is in it, it cannot be this process's own source
+        return True
+    except OSError:  # an archive, or nothing
+        return False
+
+
+def module_file(name: str) -> Path | None:
+    """Returns a module's Python file; None for what is no module, such as an imported function.
+
+    Imports nothing: `find_spec` of a dotted name would import the module before the dot, and with
+    that of an engine all of MJX or Warp.
+    """
+    if name in sys.modules:
+        spec = getattr(sys.modules[name], "__spec__", None)
+        # A run's copy of an experiment says in `__file__` where the original is.
+        file = spec.origin if spec and spec.has_location else None
+        file = file or getattr(sys.modules[name], "__file__", None)
+        return Path(file) if file else None
+    package, *inside = name.split(".")
+    spec = importlib.util.find_spec(package)
+    if spec is None:
+        return None
+    if not inside:
+        return Path(spec.origin) if spec.has_location and spec.origin else None
+    places = [Path(place, *inside) for place in spec.submodule_search_locations or ()]
+    files = [file for place in places for file in (place / "__init__.py", place.with_suffix(".py"))]
+    return next((file for file in files if file.is_file()), None)
+
+
+def _imports(file: Path) -> list[str]:
+    """Returns every name that a file's import statements may mean as a module."""
+    names: list[str] = []
+    for node in ast.walk(ast.parse(file.read_bytes())):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return names
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "absent"
+
+
+def _device_kind(device: Any) -> str:
+    """Returns the device's model; for a CPU the processor's, since kernels are chosen by it."""
+    if device.platform != "cpu":
+        return device.device_kind
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def _git(folder: Path) -> dict[str, Any]:
+    """Returns the revision of the checkout that `folder` is in, None outside of one."""
+
+    def ask(*words: str) -> str | None:
+        try:
+            done = subprocess.run(
+                ["git", "-C", str(folder), *words], capture_output=True, text=True, timeout=10
+            )
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    status = ask("status", "--porcelain", "--untracked-files=no")
+    return {
+        "git_revision": ask("rev-parse", "HEAD"),
+        "git_dirty": None if status is None else bool(status),
+    }

@@ -1,0 +1,74 @@
+"""A state as named arrays on the host, `{path: array}`, and its digest.
+
+A typed key travels as its raw data, and its path ends in `|<implementation>`.
+"""
+
+import hashlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from purerl.core.records import PyTree, is_key
+
+Leaves = dict[str, np.ndarray]
+
+
+def leaf_paths(state: PyTree) -> list[str]:
+    """Returns the path of every leaf, in the order of `jax.tree.leaves`; abstract states too."""
+    named = jax.tree_util.tree_flatten_with_path(state)[0]
+    return [
+        jax.tree_util.keystr(path, simple=True, separator="/") + _key_suffix(leaf)
+        for path, leaf in named
+    ]
+
+
+def flatten(state: PyTree) -> Leaves:
+    """Copies a state to the host as `{path: array}`, keys as their raw data.
+
+    The copy is real: on a CPU `device_get` returns views of buffers that the next, donating update
+    overwrites.
+    """
+    raw = jax.tree.map(lambda x: jax.random.key_data(x) if is_key(x) else x, state)
+    host = [np.array(x, copy=True, order="C") for x in jax.tree.leaves(jax.device_get(raw))]
+    return dict(zip(leaf_paths(state), host, strict=True))
+
+
+def unflatten(leaves: Leaves, abstract: PyTree) -> PyTree:
+    """Rebuilds a state on the device from `flatten`'s arrays (zero-size ones may be absent)."""
+    out = []
+    for path, like in zip(leaf_paths(abstract), jax.tree.leaves(abstract), strict=True):
+        # A real copy again: a buffer shared with numpy must not be donated.
+        array = jnp.array(_empty(like) if like.size == 0 else leaves[path], copy=True)
+        out.append(jax.random.wrap_key_data(array, impl=_impl(like)) if is_key(like) else array)
+    return jax.tree.unflatten(jax.tree.structure(abstract), out)
+
+
+def digest(state: PyTree) -> str:
+    """Returns the sha256 of a state: two runs with equal digests are the same run."""
+    return digest_leaves(flatten(state))
+
+
+def digest_leaves(leaves: Leaves) -> str:
+    """Returns a sha256 over path, dtype, shape and bytes of every leaf, in path order."""
+    total = hashlib.sha256()
+    for path, array in sorted(leaves.items()):
+        total.update(f"{path}\0{array.dtype}\0{array.shape}\0".encode())
+        total.update(array.tobytes())
+    return total.hexdigest()
+
+
+def _impl(key: Any) -> str:
+    """Returns the name of a key's implementation; of abstract keys too, which key_impl refuses."""
+    return str(jax.random.key_impl(jnp.empty((0,), key.dtype)))
+
+
+def _key_suffix(leaf: Any) -> str:
+    return f"|{_impl(leaf)}" if is_key(leaf) else ""
+
+
+def _empty(like: Any) -> np.ndarray:
+    if is_key(like):
+        raise ValueError(f"A zero-size array of keys (shape {like.shape}) cannot be rebuilt.")
+    return np.zeros(like.shape, like.dtype)

@@ -1,0 +1,124 @@
+"""Writes a run's metrics and checkpoints, in order, from one background thread.
+
+The order matters: a checkpoint says how long metrics.jsonl was when it was taken. One thread keeps
+it without making training wait for hashes or the disk.
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from purerl.runs import checkpoint
+from purerl.runs import state_arrays
+from purerl.core.errors import RunError, one_line
+from purerl.runs.loggers import BackgroundLogger, MetricsFile, Record, Say
+
+
+class Recorder:
+    """The only writer of a run's metrics.jsonl and checkpoints/."""
+
+    def __init__(
+        self,
+        folder: Path,
+        offset: int,
+        keep: int,
+        loggers: Sequence[BackgroundLogger],
+        say: Say,
+        worker: ThreadPoolExecutor | None = None,
+        together: Sequence[Path] = (),
+    ) -> None:
+        """Cuts metrics.jsonl to `offset` [bytes] and clears what a crash left in checkpoints/.
+
+        Seeds that train `together` (their checkpoint folders) share one `worker`: then none is
+        ever more than one checkpoint ahead of another, and all keep those they have in common.
+        """
+        self.checkpoints = folder / "checkpoints"
+        self.checkpoints.mkdir(exist_ok=True)
+        checkpoint.clean(self.checkpoints)
+        self.metrics = MetricsFile(folder / "metrics.jsonl", offset)
+        self.keep, self.say = keep, say
+        self.loggers: list[Any] = list(loggers)  # BackgroundLogger or RunVideo
+        self.worker = worker or ThreadPoolExecutor(1, "purerl-recorder")
+        self.together = together
+        self.last: Future[None] | None = None
+        self.saving: Future[None] | None = None
+        self.saved: int | None = None  # update of the newest checkpoint written here
+        self.digest: str | None = None  # of that checkpoint
+        self.failures = 0
+        self.last_failed = False  # whether the newest attempt to save failed
+
+    def write(self, record: Record) -> None:
+        """Appends a line to metrics.jsonl, soon, and hands it to the loggers."""
+        self._submit(self._write, record)
+
+    def save(
+        self, record: Record, leaves: state_arrays.Leaves, meta: dict[str, Any], planned: bool
+    ) -> None:
+        """Like `write`, then saves a checkpoint; waits only while the one before is being written.
+
+        Args:
+          record: the line; it gets the state's digest when the checkpoint is a planned one. (One
+            taken because of a signal must leave no trace in metrics.jsonl.)
+          leaves: `snapshot.flatten` of the state.
+          meta: what the checkpoint should say besides digest and length of metrics.jsonl.
+          planned: whether the run would have saved here without being interrupted.
+        """
+        if self.saving is not None:
+            self.saving.result()  # two copies of the state in memory are enough
+        self.saving = self._submit(self._save, record, leaves, meta, planned)
+
+    def finish(self) -> None:
+        """Waits until everything is on the disk; RunError if the last checkpoint is not."""
+        if self.last is not None:
+            self.last.result()
+        self.close()
+        if self.last_failed:
+            raise RunError(
+                f"The last checkpoint could not be saved ({self.failures} failed in all); the "
+                f"newest on the disk is {self._newest()}. Make room and go on with --resume."
+            )
+
+    def close(self) -> None:
+        """Stops the thread and the loggers."""
+        self.worker.shutdown()
+        self.metrics.close()
+        for logger in self.loggers:
+            logger.close()
+
+    def _submit(self, job: Any, record: Record, *arguments: Any) -> Future[None]:
+        if self.last is not None and self.last.done():
+            self.last.result()  # raises what the job raised: a defect here, not a full disk
+        for logger in self.loggers:
+            logger.log(dict(record))
+        self.last = self.worker.submit(job, dict(record), *arguments)
+        return self.last
+
+    def _write(self, record: Record) -> None:
+        try:
+            self.metrics.append(record)
+        except OSError as error:
+            self._failed(f"A line of metrics.jsonl could not be written: {one_line(error)}.")
+
+    def _save(
+        self, record: Record, leaves: state_arrays.Leaves, meta: dict[str, Any], planned: bool
+    ) -> None:
+        digest = state_arrays.digest_leaves(leaves)
+        self.last_failed = True
+        try:
+            offset = self.metrics.append(record | {"digest": digest} if planned else record)
+            meta = meta | {"digest": digest, "metrics_bytes": offset}
+            checkpoint.save(self.checkpoints, leaves, meta)
+            self.saved, self.digest, self.last_failed = meta["update"], digest, False
+            checkpoint.retain(self.checkpoints, self.keep, self.together)
+        except Exception as error:  # Orbax reports a full disk as any of several kinds
+            what = f"The checkpoint of update {meta['update']} could not be saved"
+            self._failed(f"{what}: {one_line(error)[:300]}. The newest is {self._newest()}.")
+
+    def _failed(self, message: str) -> None:
+        self.failures += 1
+        self.say(f"{message} Training goes on.")
+
+    def _newest(self) -> str:
+        found = checkpoint.updates(self.checkpoints)
+        return f"of update {found[-1]}" if found else "none"

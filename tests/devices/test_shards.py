@@ -1,0 +1,282 @@
+"""One run on any number of devices, in one process or several: the same bits."""
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
+from purerl.devices import multi_device, shards
+from purerl.exact import pallas_calls, xla_flags
+from purerl.ppo import running_moments
+from purerl.runs import build_experiment, checkpoint
+from purerl.runs.experiment import Evaluation
+from tests.runs import toy_experiment
+from tests.runs.test_run import ROOT, TOY
+
+CARTPOLE = [str(ROOT / "experiments" / "cartpole_swingup.py"), "--ppo.num-envs", "16"]
+CARTPOLE += ["--ppo.rollout-length", "8", "--ppo.num-steps", "512", "--ppo.num-minibatches", "2"]
+CARTPOLE += ["--evaluation.number", "1", "--evaluation.num-episodes", "2"]
+CARTPOLE += ["--ppo.episode-length", "12"]
+EIGHT = [str(TOY), "--ppo.num-envs", "16", "--num-shards", "8", "--checkpoints", "3"]
+
+
+def spawn(runs: Path, devices: int, *words: str) -> subprocess.Popen:
+    """Starts a run in a process that has so many virtual devices."""
+    flags = f"--xla_force_host_platform_device_count={devices} --xla_cpu_multi_thread_eigen=false"
+    return subprocess.Popen(
+        [sys.executable, "-m", "purerl.run", *words, "--runs", str(runs)],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        # The size of XLA's pool changes bits on a CPU, and it is no smaller than the devices.
+        env=os.environ | {"NPROC": "8", "XLA_FLAGS": flags},
+    )  # fmt: skip
+
+
+def start(runs: Path, devices: int, *words: str, expect: int = SUCCESS) -> str:
+    process = spawn(runs, devices, *words)
+    said = process.communicate(timeout=200)[0]
+    assert process.returncode == expect, said
+    return said
+
+
+def start_two(runs: Path, *words: str) -> list[subprocess.Popen]:
+    """Starts a run of two processes with a device each."""
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        port = probe.getsockname()[1]
+    places = [f"localhost:{port},2,{i}" for i in range(2)]
+    return [spawn(runs, 1, *words, "--distributed", place) for place in places]
+
+
+def both_end(processes: list[subprocess.Popen], code: int) -> list[str]:
+    said = [process.communicate(timeout=200)[0] for process in processes]
+    assert [process.returncode for process in processes] == [code, code], said
+    return said
+
+
+def digest(said: str) -> str:
+    return re.findall(r"Done: .* Digest (\w+)", said)[0]
+
+
+def lines(folder: Path) -> list[dict]:
+    """Returns metrics.jsonl without the clock."""
+    text = (folder / "metrics.jsonl").read_text()
+    return [json.loads(line) | {"wall_s": 0} for line in text.splitlines()]
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory) -> Path:
+    """The folder of a run of 8 shards on one device."""
+    runs = tmp_path_factory.mktemp("toy")
+    start(runs, 1, *EIGHT)
+    return runs / "toy_experiment" / "seed1"
+
+
+@pytest.mark.parametrize("devices", [2, 8])
+def test_a_run_is_the_same_on_any_number_of_devices(toy, tmp_path, devices):
+    start(tmp_path, devices, *EIGHT)
+    assert lines(tmp_path / "toy_experiment" / "seed1") == lines(toy)
+
+
+@pytest.mark.parametrize("engine", ["c", "jax"])
+def test_physics_is_the_same_on_any_number_of_devices(tmp_path, engine):
+    words = [*CARTPOLE, "--engine", engine, "--num-shards", "4"]
+    for devices in (1, 2):
+        start(tmp_path, devices, *words, "--name", str(devices))
+    if engine == "jax":  # which puts its model on a device: in two processes, each on its own
+        both_end(start_two(tmp_path, *words, "--name", "apart"), SUCCESS)
+    one, *others = (lines(folder) for folder in sorted((tmp_path / "cartpole_swingup").iterdir()))
+    assert len(others) == (2 if engine == "jax" else 1) and all(other == one for other in others)
+    assert one[-1]["train/reward"] > 0 and one[-1]["eval/episode_return"] > 0
+
+
+def test_a_run_goes_on_with_another_number_of_devices(toy, tmp_path):
+    """Without --num-shards: the run says how many it was begun with."""
+    words = [str(TOY), "--ppo.num-envs", "16", "--checkpoints", "3"]
+    start(tmp_path, 4, *words, "--num-shards", "8")
+    folder = tmp_path / "toy_experiment" / "seed1"
+    last = checkpoint.updates(folder / "checkpoints")[-1]
+    checkpoint.discard(folder / "checkpoints" / f"{last:012d}")
+    said = start(tmp_path, 2, *words, "--resume")
+    assert "Resuming after update" in said and "4 on a device" in said
+    assert lines(folder) == lines(toy)
+
+
+# Sums over 128 samples a shard, which XLA computed otherwise where a device had one shard.
+LARGER = ["--ppo.num-envs", "64", "--ppo.rollout-length", "8", "--ppo.num-steps", "2048"]
+TRAINING = ["--evaluation.number", "0"]
+
+
+def test_by_default_every_device_has_a_shard(tmp_path):
+    words = [str(TOY), *LARGER, *TRAINING]
+    said = start(tmp_path, 2, *words, "--name", "default")
+    explicit = start(tmp_path, 1, *words, "--num-shards", "2", "--name", "explicit")
+    assert digest(said) == digest(explicit)
+    folder = tmp_path / "toy_experiment"
+    assert lines(folder / "default") == lines(folder / "explicit")
+    facts = json.loads((folder / "default" / "manifest.json").read_text())
+    assert facts["num_shards"] == facts["devices"] == 2
+    assert "device_count" not in facts["flags"]["XLA_FLAGS"]
+
+
+def test_the_check_of_a_persons_own_devices():
+    """Its short form, on two virtual ones, of segments."""
+    words = ["2", "--", str(TOY), "--ppo.segment-length", "2", *TRAINING]
+    said = subprocess.run(
+        [sys.executable, "-m", "tests.checks.shards", *words],
+        cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True, timeout=200,
+    ).stdout  # fmt: skip
+    (one, *_, first), (two, *_, second) = (line.split() for line in said.splitlines()[1:])
+    assert (one, two) == ("1", "2") and first == second and len(first) == 16
+
+
+@pytest.mark.parametrize("by_kernel", [False, True])
+def test_what_is_set_apart_stays_as_it_is(by_kernel, monkeypatch):
+    monkeypatch.setattr(pallas_calls, "can_run", lambda: by_kernel)
+    tree = {
+        "float": jnp.array([[0.0, -0.0], [jnp.inf, -1e-42]]),
+        "half": jnp.array(1.5, jnp.bfloat16),
+        "int": jnp.array([-(2**31), 0, 7]),
+        "unsigned": jnp.array([0, 2**32 - 1], jnp.uint32),
+        "truth": jnp.array([True, False]),
+        "nothing": jnp.zeros((0, 3)),
+        "long": jnp.arange(1000).reshape(4, 250),
+    }
+    for apart in (shards.set_apart, jax.jit(shards.set_apart)):
+        for before, after in zip(jax.tree.leaves(tree), jax.tree.leaves(apart(tree)), strict=True):
+            assert (after.shape, after.dtype) == (before.shape, before.dtype)
+            assert np.asarray(after).tobytes() == np.asarray(before).tobytes()
+
+
+def test_a_shard_and_what_shards_send_are_copied_by_a_kernel(monkeypatch):
+    """On a CPU bits are the same without, nearly always."""
+    monkeypatch.setattr(pallas_calls, "can_run", lambda: True)
+    cut = shards.Shards(2)
+    weight = jnp.ones(3)
+    run = jax.make_jaxpr(lambda x: shards.total(cut, lambda y: (weight * y).sum(0), x))
+    closed = run(jnp.ones((2, 5, 3)))
+
+    def passes(jaxpr):  # in order, and how many arrays each
+        return [len(e.outvars) for e in jaxpr.eqns if e.primitive.name == "pallas_call"]
+
+    (loop,) = [e for e in closed.jaxpr.eqns if e.primitive.name == "scan"]
+    assert passes(loop.params["jaxpr"].jaxpr) == [2, 1]  # the weight and the shard; the sum
+    assert passes(closed.jaxpr) == [1]  # all sums
+    monkeypatch.setattr(pallas_calls, "AT_ONCE", 3)
+    assert passes(jax.make_jaxpr(shards.set_apart)([weight] * 7).jaxpr) == [3, 3, 1]
+
+
+def test_passes_that_are_off_are_the_users_too(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_a=b --xla_disable_hlo_passes=dce,fusion")
+    assert xla_flags.equal_passes()[xla_flags.PASSES] == f"{xla_flags.UNEQUAL_PASSES},dce,fusion"
+    monkeypatch.delenv("XLA_FLAGS")
+    assert xla_flags.equal_passes()[xla_flags.PASSES] == xla_flags.UNEQUAL_PASSES
+
+
+def test_what_learns_from_several_shards_is_compiled_without_them(monkeypatch):
+    monkeypatch.setattr(xla_flags, "equal_passes", lambda: {"xla_no_such_option": "1"})
+    config, env, network, _ = build_experiment.build(toy_experiment.experiment)
+    with pytest.raises(Exception, match="xla_no_such_option"):
+        multi_device.compile_programs(
+            config, env, network, Evaluation(number=0), True, shards.Shards(2)
+        )
+
+
+# --- several processes ---
+
+
+def test_two_processes_are_as_one(toy, tmp_path):
+    first, second = both_end(start_two(tmp_path, *EIGHT), SUCCESS)
+    assert lines(tmp_path / "toy_experiment" / "seed1") == lines(toy)
+    assert "Digest" in first and "update" not in second  # one speaks for both
+
+
+def test_a_signal_to_one_stops_all_and_the_run_goes_on_in_one(tmp_path):
+    long = [*EIGHT, "--ppo.num-steps", "19200", "--evaluation.number", "0"]
+    start(tmp_path, 1, *long, "--name", "undisturbed")
+    processes = start_two(tmp_path, *long)
+    folder = tmp_path / "toy_experiment" / "seed1"
+    while not (folder / "metrics.jsonl").exists() or len(lines(folder)) < 5:
+        assert all(process.poll() is None for process in processes)
+        time.sleep(0.02)
+    processes[1].send_signal(signal.SIGTERM)
+    first, second = both_end(processes, INTERRUPTED)
+    stopped = [re.findall(r"Stopped after update (\d+) of 300", said) for said in (first, second)]
+    assert stopped[0] == stopped[1] and 5 <= int(stopped[0][0]) < 300
+    assert f"Resuming after update {stopped[0][0]}" in start(tmp_path, 1, *long, "--resume")
+    assert lines(folder) == lines(folder.with_name("undisturbed"))
+
+
+def test_a_process_that_loses_the_other_says_so(tmp_path):
+    endless = [*EIGHT, "--ppo.num-steps", "6400000", "--evaluation.number", "0"]
+    processes = start_two(tmp_path, *endless)
+    metrics = tmp_path / "toy_experiment" / "seed1" / "metrics.jsonl"
+    while not metrics.exists():
+        assert all(process.poll() is None for process in processes)
+        time.sleep(0.02)
+    processes[1].kill()
+    said = processes[0].communicate(timeout=100)[0]
+    assert processes[0].returncode == FAILURE and "Traceback" not in said
+    assert "another is gone" in said.splitlines()[-1] and "--resume" in said
+
+
+def test_mistakes_end_all_processes(toy, tmp_path):
+    said = both_end(start_two(toy.parent.parent, *EIGHT), USAGE)
+    assert all("seed1 exists; use --resume to go on" in one for one in said)
+    said = both_end(start_two(tmp_path, str(TOY), "--num-shards", "1"), USAGE)
+    assert all("there are 2 processes with 2 devices" in one for one in said)
+    one = start(tmp_path, 1, str(TOY), "--distributed", "localhost:80", expect=USAGE)
+    assert "it must be auto or HOST:PORT,NUM_PROCESSES,PROCESS_ID" in one
+
+
+# --- sizes ---
+
+
+@pytest.mark.parametrize(
+    ("words", "rule"),
+    [
+        ([], "num_shards = 3 does not divide num_envs = 8"),
+        (["--num-shards", "4"], "cannot be shared by 3 devices; num_shards could be 1, 3, 6"),
+        (["--num-shards", "6", "--ppo.num-envs", "12", "--ppo.num-minibatches", "3"],
+         "num_minibatches = 3 does not divide num_envs / num_shards * rollout_length = 8"),
+        (["--num-shards", "3", "--num-seeds", "2"], "num_shards is 3, and 2 vmapped seeds"),
+    ],
+)  # fmt: skip
+def test_sizes_that_do_not_divide(tmp_path, words, rule):
+    said = start(tmp_path, 3, str(TOY), *words, expect=USAGE)
+    assert rule in said and "Traceback" not in said
+    assert not (tmp_path / "toy_experiment").exists()
+
+
+# --- the arithmetic ---
+
+
+def test_shards_add_in_one_order_whatever_their_number():
+    x = jax.random.normal(jax.random.key(0), (7, 3)) * 10.0 ** jnp.arange(7)[:, None]
+    a, b, c, d, e, f, g = np.asarray(x)
+    expected = ((a + d) + (c + f)) + ((b + e) + g)
+    np.testing.assert_allclose(shards.add_in_order(x), expected, rtol=1e-6)
+    assert shards.add_in_order(jnp.array([1e8, 1.0, -1e8, 1.0])) == 2.0  # (a + c) + (b + d)
+
+
+def test_pooled_moments_are_those_of_all_samples():
+    samples = jax.random.normal(jax.random.key(1), (4, 5, 2)) * 3.0 + 40.0
+    valid = jax.random.bernoulli(jax.random.key(2), 0.7, (4, 5)).at[1].set(False)
+    start = running_moments.update(
+        running_moments.init(jnp.zeros(2)), samples[0] + 1.0, jnp.ones(5, bool)
+    )
+    parts = jax.vmap(lambda x, v: running_moments.moments(start, x, v))(samples, valid)
+    pooled = running_moments.merge(start, running_moments.pool(parts))
+    whole = running_moments.update(start, samples.reshape(20, 2), valid.reshape(20))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), pooled, whole)
+    assert pooled.count.low == 5 + valid.sum()

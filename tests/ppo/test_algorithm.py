@@ -1,0 +1,620 @@
+"""PPO semantics: each line against a slow, obvious reference."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from purerl.core.env import State
+from purerl.core.records import count_as_int
+from purerl.devices import compilation, slices
+from purerl.devices.shards import Shards, move
+from purerl.ppo import algorithm, batches, evaluation, learner, losses, networks, running_moments
+from purerl.ppo.batches import Batch
+from purerl.ppo.rollout import rollout
+from purerl.runs.experiment import Evaluation
+from tests import quick
+
+MLP = networks.MlpOptions(policy_hidden=(8,), value_hidden=(8,))
+GRU = networks.RecurrentOptions(hidden=8, encoder=(8,), value_hidden=(8,))
+LENGTH = 7
+CONFIG = algorithm.Config(
+    num_steps=6 * 16 * 100,
+    num_envs=6,
+    rollout_length=16,
+    num_epochs=2,
+    num_minibatches=3,
+    episode_length=LENGTH,
+    gamma=0.9,
+    learning_rate=1e-2,
+    reset_pool=18,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Walk:
+    """A number that drifts by the action; terminates beyond `edge`; NaN beyond `cliff`."""
+
+    edge: float = 1e3
+    cliff: float = 1e3
+    control_timestep: float = 1.0
+    action_size: int = 1
+
+    def reset(self, key):
+        x = jax.random.uniform(key, (), minval=-0.5, maxval=0.5)
+        return self.state(x, jnp.zeros(()), x)
+
+    def step(self, state, action):
+        x = state.physics["x"] + action[0]
+        return self.state(x, x - state.physics["x"], state.task["start"])
+
+    def state(self, x, reward, start):
+        broken = jnp.where(jnp.abs(x) > self.cliff, jnp.nan, x)
+        return State(
+            physics={"x": broken},
+            observation=jnp.stack([broken, jnp.square(broken)]),
+            reward=reward + jnp.where(jnp.abs(x) > self.cliff, jnp.nan, 0.0),
+            terminated=jnp.abs(x) > self.edge,
+            truncated=jnp.zeros((), bool),
+            metrics={"position": broken, "moves_count": jnp.ones(())},
+            task={"start": start},
+        )
+
+
+INIT = quick.jit(algorithm.init, static_argnums=(0, 1, 2))
+UPDATE = quick.jit(algorithm.update, static_argnums=(0, 1, 2))
+ROLLOUT = quick.jit(rollout, static_argnums=(0, 1, 2))
+NETWORKS = {
+    False: networks.mlp(MLP, jnp.zeros(2), 1),
+    True: networks.recurrent(GRU, jnp.zeros(2), 1),
+}
+
+
+def setup(config=CONFIG, env=None, recurrent=False, seed=0):
+    """An initial state whose statistics are not trivial, and everything that made it."""
+    env = Walk() if env is None else env
+    network = NETWORKS[recurrent]
+    state = INIT(config, env, network, jax.random.key(seed))
+    samples = jax.random.normal(jax.random.key(9), (50, 2)) * 2.0 + 0.3
+    statistics = running_moments.update(state.normalizer, samples, jnp.ones(50, bool))
+    return env, network, state.replace(normalizer=statistics)
+
+
+@pytest.mark.parametrize("recurrent", [False, True])
+def test_the_first_ratio_is_one(recurrent):
+    """Before any gradient step, the learner computes the very log-probability that acted."""
+    config = dataclasses.replace(CONFIG, num_epochs=1, num_minibatches=1, num_envs=6)
+    env, network, state = setup(config, recurrent=recurrent)
+    _, metrics = UPDATE(config, env, network, state)
+    assert abs(metrics["kl"]) < 1e-10
+    assert metrics["clip_fraction"] == 0.0
+
+
+def test_statistics_are_frozen_until_the_end_of_the_update():
+    env, network, state = setup()
+    after, transitions, _, _ = ROLLOUT(CONFIG, env, network, state)
+    assert count_as_int(after.normalizer.count) == 50
+    updated, _ = UPDATE(CONFIG, env, network, state)
+    assert count_as_int(updated.normalizer.count) == 50 + 6 * 16
+    expected = running_moments.update(
+        state.normalizer, transitions.observation, jnp.ones((16, 6), bool)
+    )
+    np.testing.assert_allclose(
+        updated.normalizer.mean.value, expected.mean.value, rtol=1e-5, atol=1e-6
+    )
+
+
+def test_time_limits_truncate_and_the_first_are_staggered():
+    env, network, state = setup()
+    limits = np.asarray(state.episode.limit)
+    assert len(set(limits.tolist())) > 2 and limits.max() <= LENGTH and limits.min() >= 1
+    _, transitions, finished, _ = ROLLOUT(CONFIG, env, network, state)
+    done = np.asarray(transitions.done)
+    for b in range(6):
+        ends = np.flatnonzero(done[:, b]) + 1
+        assert ends[0] == limits[b]
+        assert (np.diff(ends) == LENGTH).all()
+    assert not transitions.terminated.any()
+    np.testing.assert_array_equal(transitions.truncated, done)
+    np.testing.assert_array_equal(finished.episodes, done.sum(0))
+
+
+def test_every_start_is_fresh():
+    """No two episodes of an update begin alike, nor do those of the next update."""
+    env, network, state = setup()
+    starts = []
+    update = partial(UPDATE, CONFIG, env, network)
+    for _ in range(2):
+        _, transitions, _, _ = ROLLOUT(CONFIG, env, network, state)
+        first = np.concatenate([np.zeros((1, 6), bool), np.asarray(transitions.done)[:-1]])
+        starts += np.asarray(transitions.observation)[first][:, 0].tolist()
+        state, metrics = update(state)
+        assert metrics["replayed_resets"] == 0
+    assert len(starts) > 20 and len(set(starts)) == len(starts)
+
+
+def test_replayed_starts_are_counted():
+    config = dataclasses.replace(CONFIG, reset_pool=6)
+    env, network, state = setup(config)
+    _, transitions, finished, _ = ROLLOUT(config, env, network, state)
+    _, metrics = UPDATE(config, env, network, state)
+    ends = np.asarray(transitions.done).sum(0)
+    assert metrics["replayed_resets"] == np.maximum(ends - 1, 0).sum() > 0
+
+
+def test_a_shared_pool_gives_each_start_to_several_environments():
+    config = dataclasses.replace(CONFIG, reset_pool=2, num_envs=6)
+    env, network, state = setup(config)
+    _, transitions, _, _ = ROLLOUT(config, env, network, state)
+    _, metrics = UPDATE(config, env, network, state)
+    done = np.asarray(transitions.done)
+    begins = np.asarray(transitions.observation)[1:][done[:-1]][:, 0]
+    places = np.nonzero(done[:-1])[1]
+    for parity in (0, 1):
+        assert len(set(begins[places % 2 == parity].tolist())) == 1
+    assert len(set(begins.tolist())) == 2
+    ends = done.sum(0)
+    assert metrics["replayed_resets"] == sum(ends[p::2].sum() - 1 for p in (0, 1)) > 0
+
+
+@pytest.mark.parametrize("pool", [-1, 4, 9])
+def test_a_pool_that_cannot_be_shared_evenly_is_refused(pool):
+    with pytest.raises(ValueError, match=f"reset_pool is {pool}; with num_envs = 6"):
+        dataclasses.replace(CONFIG, reset_pool=pool)
+
+
+@pytest.mark.parametrize(
+    "schedule, update, rate", [("constant", 3, 0.5), ("linear", 25, 0.375), ("adaptive_kl", 3, 0.1)]
+)
+def test_where_the_learning_rate_of_an_update_comes_from(schedule, update, rate):
+    """100 updates; 0.5 is the setting, 0.1 what the state was left with."""
+    config = dataclasses.replace(CONFIG, schedule=schedule, learning_rate=0.5)
+    state = setup()[2].replace(learning_rate=jnp.float32(0.1), update=jnp.int32(update))
+    assert learner.scheduled_rate(config, state) == pytest.approx(rate)
+
+
+def slow_batch(transitions, last_value, observations_before_reset, value_of, gamma, lambda_):
+    """Advantages, one step at a time, with V of the observation before each reset."""
+    steps, size = transitions.reward.shape
+    advantage = np.zeros((steps + 1, size))
+    for t in reversed(range(steps)):
+        for b in range(size):
+            if transitions.truncated[t, b]:
+                following = value_of(observations_before_reset[t, b])
+            else:
+                following = transitions.value[t + 1, b] if t + 1 < steps else last_value[b]
+            alive = 1.0 - transitions.terminated[t, b]
+            delta = transitions.reward[t, b] + gamma * alive * following - transitions.value[t, b]
+            carry = 0.0 if transitions.done[t, b] else gamma * lambda_ * advantage[t + 1, b]
+            advantage[t, b] = delta + carry
+    return advantage[:-1]
+
+
+def test_truncation_bootstraps_from_the_observation_before_the_reset():
+    env, network, state = setup(env=Walk(edge=1.5))
+    after, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
+    batch = batches.make_batch(CONFIG, state, transitions, last_value, state.episode.length == 0)
+    transitions = jax.tree.map(np.asarray, transitions)
+    assert transitions.terminated.any() and transitions.truncated.any()
+    moved = transitions.observation[..., 0] + np.tanh(transitions.raw_action[..., 0])
+    before_reset = np.stack([moved, moved**2], -1)
+
+    def value_of(observation):
+        features = running_moments.normalize(state.normalizer, jnp.asarray(observation))
+        return float(network.apply(state.params, features, ())[0].value)
+
+    expected = slow_batch(
+        transitions, np.asarray(last_value), before_reset, value_of, 0.9, CONFIG.gae_lambda
+    )
+    np.testing.assert_allclose(batch.advantage, expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(batch.target, expected + transitions.value, rtol=1e-4, atol=1e-5)
+    first = np.asarray(batch.first)
+    np.testing.assert_array_equal(first[1:], transitions.done[:-1])
+    assert first[0].all()
+
+
+@pytest.mark.parametrize("length", [4, 16])
+def test_segments_are_estimated_from_the_values_of_now(length):
+    """Each segment against the slow reference: it bootstraps where it ends, from new parameters."""
+    config = dataclasses.replace(CONFIG, segment_length=length)
+    env, network, state = setup(env=Walk(edge=1.5))
+    after, transitions, _, last_value = ROLLOUT(config, env, network, state)
+    batch = batches.make_batch(config, after, transitions, last_value, state.episode.length == 0)
+    params = jax.tree.map(lambda x: 1.5 * x + 0.1, state.params)
+    segments = batches.in_segments(length, batch)
+    renewed = batches.renew(config, network, params, segments, ())
+    np.testing.assert_array_equal(renewed.log_prob, segments.log_prob.reshape(1, -1))
+    advantage = renewed.advantage.reshape(length, -1)
+    target = renewed.target.reshape(length, -1)
+
+    def value_of(features):
+        return np.asarray(network.apply(params, features, ())[0].value)
+
+    moved = transitions.observation[..., 0] + np.tanh(transitions.raw_action[..., 0])
+    last = value_of(running_moments.normalize(state.normalizer, after.env.observation))
+    values = value_of(batch.observation)
+    following = np.concatenate([values[1:], last[None]])
+    now = jax.tree.map(np.asarray, transitions._replace(value=values))
+
+    def kept_value(observation):  # at a truncation: that of the policy that acted
+        features = running_moments.normalize(state.normalizer, jnp.asarray(observation))
+        return float(network.apply(state.params, features, ())[0].value)
+
+    for i in range(0, 16, length):
+        part = jax.tree.map(lambda x, i=i: x[i : i + length], now)
+        before_reset = np.stack([moved, moved**2], -1)[i : i + length]
+        end = following[i + length - 1]
+        expected = slow_batch(part, end, before_reset, kept_value, 0.9, config.gae_lambda)
+        columns = slice(i // length * 6, (i // length + 1) * 6)
+        np.testing.assert_allclose(advantage[:, columns], expected, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(target[:, columns], expected + part.value, rtol=1e-4, atol=1e-5)
+
+
+def test_segments_stay_whole_and_are_renewed_before_each_gradient_step(monkeypatch):
+    config = dataclasses.replace(CONFIG, segment_length=4)
+    env, network, state = setup()
+    seen = []
+
+    def spy(config, network, params, batch, memory):
+        jax.debug.callback(lambda *x: seen.append(x), params, batch.course.reward)
+        return batches.renew(config, network, params, batch, memory)
+
+    monkeypatch.setattr(learner, "renew", spy)
+    jax.block_until_ready(jax.jit(partial(algorithm.update, config, env, network))(state))
+    jax.effects_barrier()
+    assert len(seen) == config.num_epochs * config.num_minibatches
+    firsts = {np.asarray(jax.tree.leaves(params)[0]).tobytes() for params, _ in seen}
+    assert len(firsts) == len(seen)
+    _, transitions, _, _ = ROLLOUT(CONFIG, env, network, state)
+    whole = np.asarray(transitions.reward).reshape(4, 4, 6).swapaxes(0, 1).reshape(4, -1)
+    epoch = np.concatenate([reward for _, reward in seen[: config.num_minibatches]], axis=1)
+    assert {column.tobytes() for column in epoch.T} == {column.tobytes() for column in whole.T}
+
+
+@pytest.mark.parametrize("cut", [Shards(), Shards(2)])
+def test_advantages_of_a_minibatch_are_scaled_by_its_own(cut):
+    shape = (2, 1, 12) if cut.number > 1 else (1, 12)
+    advantage = jax.random.normal(jax.random.key(0), shape)
+    weight = jax.random.bernoulli(jax.random.key(1), 0.8, shape).astype(jnp.float32)
+    batch = Batch(*[advantage] * 8)._replace(weight=weight)
+    order = learner.shuffle(jax.random.key(2), 12, 3, cut)  # 3 minibatches
+    found = learner.scales_of_all(batch, order, cut)
+    for k in range(3):
+        part, _ = move(cut, learner._take, batch, (), order[k])
+        expected = losses.advantage_scale(part.advantage, part.weight)
+        for one, other in zip(found, expected, strict=True):
+            np.testing.assert_allclose(one[k], other, rtol=1e-5)
+
+
+def test_recurrent_memory_restarts_with_each_episode_in_rollout_and_learner():
+    """The learner's unroll, from the stored memory, gives the rollout's values bit for bit."""
+    env, network, state = setup(recurrent=True)
+    update = partial(UPDATE, CONFIG, env, network)
+    for _ in range(2):  # so that memories are not zero when the rollout begins
+        state, _ = update(state)
+    assert jnp.abs(state.carry).max() > 0
+    _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
+    first = state.episode.length == 0
+    batch = batches.make_batch(CONFIG, state, transitions, last_value, first)
+    output = learner.unroll(network, state.params, batch, state.carry)
+    np.testing.assert_allclose(output.value, transitions.value, rtol=1e-5, atol=1e-6)
+    # By hand: at a start the memory is zero.
+    t, b = np.argwhere(np.asarray(batch.first)[1:])[0] + [1, 0]
+    features = batch.observation[t, b]
+    fresh = network.apply(state.params, features, jnp.zeros(8))[0].value
+    np.testing.assert_allclose(transitions.value[t, b], fresh, rtol=1e-5, atol=1e-6)
+
+
+def test_action_repeat_stops_at_the_end_of_an_episode():
+    """Episodes of 7 control steps, actions held for 3: 3 + 3 + 1, and rewards add up."""
+    config = dataclasses.replace(CONFIG, action_repeat=3, rollout_length=8)
+    env, network, state = setup(config)
+    state = state.replace(episode=state.episode.replace(limit=jnp.full(6, LENGTH, jnp.int32)))
+    _, transitions, finished, _ = ROLLOUT(config, env, network, state)
+    action = np.tanh(np.asarray(transitions.raw_action)[..., 0])
+    held = np.tile(np.array([3, 3, 1])[:, None], (3, 6))[:8]
+    np.testing.assert_allclose(transitions.reward, action * held, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(np.asarray(transitions.done)[:, 0], held[:, 0] == 1)
+    np.testing.assert_array_equal(finished.length / finished.episodes, LENGTH)
+    np.testing.assert_array_equal(finished.metrics["moves_count"] / finished.episodes, LENGTH)
+
+
+@dataclasses.dataclass(frozen=True)
+class BadStarts(Walk):
+    """One of five starts is NaN."""
+
+    def reset(self, key):
+        state = super().reset(key)
+        x = jnp.where(jnp.abs(state.physics["x"]) > 0.4, jnp.nan, state.physics["x"])
+        return self.state(x, jnp.zeros(()), x)
+
+
+@pytest.mark.parametrize("recurrent", [False, True])
+def test_a_start_that_is_no_number_costs_its_own_step_alone(recurrent):
+    env, network, state = setup(env=BadStarts(), recurrent=recurrent)
+    for _ in range(3):
+        state, metrics = UPDATE(CONFIG, env, network, state)
+        assert metrics["nonfinite_resets"] > 0 and metrics["skipped_minibatches"] == 0
+        assert all(np.isfinite(x) for x in metrics.values())
+    for leaf in jax.tree.leaves((state.params, state.optimizer, state.normalizer)):
+        assert np.isfinite(np.asarray(leaf, np.float64)).all()
+
+
+def test_a_blown_up_environment_is_contained():
+    """Environment 3 goes NaN: counted, reset, weight 0; the others' bits are the same."""
+    sound_env, network, state = setup()
+    # The last moves of environment 3 alone lead beyond the cliff.
+    x = state.env.physics["x"].at[3].set(40.0)
+    state = state.replace(env=state.env.replace(physics={"x": x}))
+    broken_env = Walk(cliff=39.5)
+    after, sound, _, _ = ROLLOUT(CONFIG, sound_env, network, state)
+    contained, lost, finished, _ = ROLLOUT(CONFIG, broken_env, network, state)
+    assert (~np.asarray(lost.valid)).sum(0).tolist()[3] >= 1
+    assert finished.nonfinite_resets.sum() == (~lost.valid).sum() == finished.nonfinite_resets[3]
+    for a, b in zip(jax.tree.leaves(sound), jax.tree.leaves(lost), strict=True):
+        others = [0, 1, 2, 4, 5]
+        np.testing.assert_array_equal(np.asarray(a)[:, others], np.asarray(b)[:, others])
+    for leaf in jax.tree.leaves((lost, contained.env, contained.episode)):
+        assert np.isfinite(np.asarray(leaf, np.float64)).all()
+    updated, metrics = UPDATE(CONFIG, broken_env, network, state)
+    assert metrics["nonfinite_resets"] >= 1 and metrics["skipped_minibatches"] == 0
+    valid = int(lost.valid.sum())
+    assert count_as_int(updated.normalizer.count) == 50 + valid < 50 + 6 * 16
+    for leaf in jax.tree.leaves(updated.params):
+        assert jnp.isfinite(leaf).all()
+
+
+def test_a_lost_sample_has_no_weight_in_the_update():
+    """Whatever stands in the lost rows, the gradient is the same."""
+    env, network, state = setup()
+    _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
+    valid = transitions.valid.at[5, 2].set(False)
+    done = transitions.done.at[5, 2].set(True)
+    lost = transitions._replace(valid=valid, done=done)
+    odd = lost._replace(
+        reward=lost.reward.at[5, 2].set(1e4), raw_action=lost.raw_action.at[5, 2].set(3.0)
+    )
+    learned = []
+    for x in (lost, odd):
+        batch = batches.make_batch(CONFIG, state, x, last_value, state.episode.length == 0)
+        learned.append(learner.learn(CONFIG, network, state, batch, ())[0])
+    for a, b in zip(*(jax.tree.leaves(x.params) for x in learned), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    "recurrent, segment_length, size",
+    [(False, 0, (1, 32)), (True, 0, (16, 2)), (False, 4, (4, 8))],
+)
+def test_a_gradient_in_slices_is_the_same_sum(monkeypatch, recurrent, segment_length, size):
+    """As on a GPU: of 3 minibatches of samples, sequences or segments, each in 2 slices."""
+    env, network, state = setup(recurrent=recurrent)
+    config = dataclasses.replace(CONFIG, segment_length=segment_length)
+    memory = state.carry  # before the rollout
+    after, transitions, _, last_value = ROLLOUT(config, env, network, state)
+    batch = batches.make_batch(config, after, transitions, last_value, state.episode.length == 0)
+    whole, metrics = learner.learn(config, network, after, batch, memory)
+    asked = []
+    monkeypatch.setattr(learner, "count_slices", lambda *size: asked.append(size) or 2)
+    sliced, others = learner.learn(config, network, after, batch, memory)
+    assert asked == [(*size, "cpu")]
+    for a, b in zip(jax.tree.leaves(whole.params), jax.tree.leaves(sliced.params), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4)
+    assert float(others["value_loss"]) == pytest.approx(float(metrics["value_loss"]), rel=1e-3)
+
+
+def altered(network, change):
+    """The network with other parameters or another memory, which its `apply` undoes."""
+
+    def init(key):
+        params, carry = network.init(key)
+        return change(params, carry)
+
+    return network._replace(init=init)
+
+
+def test_parameters_that_no_gradient_changes_are_refused():
+    whole = altered(
+        NETWORKS[False], lambda params, carry: (params | {"table": jnp.arange(3)}, carry)
+    )
+    with pytest.raises(ValueError, match=r"\['table'\] is int32: parameters are trained"):
+        jax.eval_shape(partial(algorithm.init, CONFIG, Walk(), whole), jax.random.key(0))
+
+
+def test_parameters_of_half_precision_stay_so():
+    half = altered(
+        NETWORKS[False],
+        lambda params, carry: (jax.tree.map(lambda x: x.astype(jnp.bfloat16), params), carry),
+    )
+    state, metrics = UPDATE(CONFIG, Walk(), half, INIT(CONFIG, Walk(), half, jax.random.key(0)))
+    assert {x.dtype.name for x in jax.tree.leaves(state.params)} == {"bfloat16"}
+    assert metrics["skipped_minibatches"] == 0 and metrics["gradient_norm"] > 0
+
+
+def unmade(function, *arguments):
+    with pytest.raises(ValueError) as error:
+        function(*arguments)
+    return str(error.value)
+
+
+def test_what_a_network_cannot_read_is_told():
+    zeros = jnp.zeros(2)
+    said = unmade(networks.mlp, MLP, {"state": zeros, "privileged": zeros}, 1)
+    assert "dict of privileged, state" in said and "must be called policy" in said
+    assert "is of shape (3, 2); this network takes arrays [O]" in unmade(
+        networks.recurrent, GRU, jnp.zeros((3, 2)), 1
+    )
+    assert "part eyes is a dict" in unmade(networks.mlp, MLP, {"policy": zeros, "eyes": {}}, 1)
+    assert "initial_std is 0.0" in unmade(lambda: networks.MlpOptions(initial_std=0.0))
+    assert "starts an episode at zero" in unmade(
+        networks.from_linen, networks.RecurrentActorCritic(GRU, 1), zeros, jnp.ones(8)
+    )
+    networks.mlp(MLP, {"policy": zeros, "privileged": zeros}, 1)
+
+
+@pytest.mark.parametrize(("name", "value"), [("value_clip", -1.0), ("entropy_weight", jnp.nan)])
+def test_weights_have_a_sign(name, value):
+    assert name in unmade(lambda: dataclasses.replace(CONFIG, **{name: value}))
+
+
+def test_a_memory_may_hold_integers():
+    def apply(params, observation, carry):
+        output, memory = NETWORKS[True].apply(params, observation, carry["memory"])
+        return output, {"memory": memory, "count": carry["count"] + 1}
+
+    counting = altered(
+        NETWORKS[True], lambda params, memory: (params, {"memory": memory, "count": jnp.int32(0)})
+    )._replace(apply=apply)
+    state = INIT(CONFIG, Walk(), counting, jax.random.key(0))
+    state, metrics = UPDATE(CONFIG, Walk(), counting, state)
+    assert state.carry["count"].dtype == jnp.int32 and metrics["skipped_minibatches"] == 0
+    evaluation.evaluate(CONFIG, Walk(), counting, state, jax.random.key(1), 2)
+
+
+@pytest.mark.parametrize(
+    "rows, columns, platform, number",
+    [
+        (1, 10240, "gpu", 16),
+        (1, 10240, "cpu", 1),
+        (1, 1024, "gpu", 4),  # 256 samples a slice at least
+        (1, 255, "gpu", 1),
+        (1, 5 * 512, "gpu", 8),
+        (32, 64, "gpu", 8),  # of sequences, whole ones
+        (32, 63, "gpu", 1),
+    ],
+)
+def test_slices_are_equal_and_not_too_small(rows, columns, platform, number):
+    assert slices.count_slices(rows, columns, platform) == number
+
+
+def test_a_non_finite_minibatch_is_skipped_and_counted():
+    env, network, state = setup()
+    _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
+    broken = transitions._replace(reward=transitions.reward.at[:].set(jnp.nan))
+    batch = batches.make_batch(CONFIG, state, broken, last_value, state.episode.length == 0)
+    after, metrics = learner.learn(CONFIG, network, state, batch, ())
+    assert metrics["skipped_minibatches"] == metrics["skipped_in_a_row"] == 6
+    assert np.isfinite(metrics["policy_loss"])
+    for a, b in zip(jax.tree.leaves(state.params), jax.tree.leaves(after.params), strict=True):
+        np.testing.assert_array_equal(a, b)
+    sound = batches.make_batch(CONFIG, state, transitions, last_value, state.episode.length == 0)
+    again, _ = learner.learn(CONFIG, network, after, sound, ())
+    assert again.skipped_in_a_row == 0
+
+
+def test_linear_schedule_and_exact_budget():
+    config = dataclasses.replace(CONFIG, schedule="linear", num_steps=6 * 16 * 4 + 95)
+    assert config.num_updates == 4
+    assert config.num_updates * config.steps_per_update <= config.num_steps
+    env, network, state = setup(config)
+    update = partial(UPDATE, config, env, network)
+    rates = []
+    for _ in range(config.num_updates):
+        state, metrics = update(state)
+        rates.append(float(metrics["learning_rate"]))
+    np.testing.assert_allclose(rates, [1e-2, 7.5e-3, 5e-3, 2.5e-3], rtol=1e-6)
+    assert count_as_int(state.steps) == 6 * 16 * 4
+
+
+@pytest.mark.parametrize(("kl", "factor"), [(0.001, 1.5), (0.01, 1.0), (0.1, 1 / 1.5)])
+def test_adaptive_learning_rate(kl, factor):
+    config = dataclasses.replace(CONFIG, schedule="adaptive_kl", desired_kl=0.01)
+    rate = learner.next_rate(config, jnp.asarray(1e-3), jnp.asarray(kl), jnp.asarray(True))
+    np.testing.assert_allclose(rate, 1e-3 * factor, rtol=1e-6)
+    unmoved = learner.next_rate(config, jnp.asarray(1e-3), jnp.asarray(kl), jnp.asarray(False))
+    np.testing.assert_allclose(unmoved, 1e-3)
+
+
+def test_reward_scaling_by_the_running_return():
+    config = dataclasses.replace(CONFIG, reward_scaling="return_std")
+    env, network, state = setup(config)
+    assert batches.reward_factor(config, state) == 1.0
+    _, transitions, _, _ = ROLLOUT(config, env, network, state)
+    state, _ = UPDATE(config, env, network, state)
+    # By hand: G_t = gamma G_{t-1} + r_t, from 0 after each end.
+    reward, done = np.asarray(transitions.reward), np.asarray(transitions.done)
+    running, returns = np.zeros(6), []
+    for r, d in zip(reward, done, strict=True):
+        running = 0.9 * running + r
+        returns.append(running.copy())
+        running[d] = 0.0
+    np.testing.assert_allclose(batches.reward_factor(config, state), 1 / np.std(returns), rtol=1e-4)
+
+
+def test_the_same_seed_learns_the_same_bits_and_another_does_not():
+    states = []
+    for seed in (0, 0, 1):
+        env, network, state = setup(seed=seed)
+        update = partial(UPDATE, CONFIG, env, network)
+        for _ in range(3):
+            state, _ = update(state)
+        states.append(np.concatenate([np.ravel(x) for x in jax.tree.leaves(state.params)]))
+    np.testing.assert_array_equal(states[0], states[1])
+    assert (states[0] != states[2]).any()
+
+
+def test_update_keeps_rank_promotion_strict():
+    """`[B, 1] - [B]` would silently become `[B, B]`; the whole update is traced without it."""
+    env, network, state = setup(recurrent=True)
+    with jax.numpy_rank_promotion("raise"):
+        UPDATE.trace(CONFIG, env, network, state)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"num_steps": 95}, ("num_steps is 95", "96")),
+        ({"gamma": 1.5}, ("gamma is 1.5", "[0, 1]")),
+        ({"num_envs": 0}, ("num_envs is 0", "at least 1")),
+        ({"clip": 0.0}, ("clip is 0.0", "above 0")),
+        ({"segment_length": -4}, ("segment_length is -4", "0 or above")),
+        ({"segment_length": 5}, ("segment_length = 5", "rollout_length = 16", "4")),
+    ],
+)
+def test_impossible_settings_are_refused(changes, words):
+    with pytest.raises(ValueError) as error:
+        dataclasses.replace(CONFIG, **changes)
+    for word in words:
+        assert word in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("recurrent", "minibatches", "words"),
+    [
+        (False, 7, ("num_minibatches = 7", "num_envs * rollout_length = 96", "6, 8", "91 or 98")),
+        (True, 4, ("num_minibatches = 4", "num_envs = 6", "3", "4 or 8", "recurrent")),
+    ],
+)
+def test_sizes_that_do_not_divide(recurrent, minibatches, words):
+    config = dataclasses.replace(CONFIG, num_minibatches=minibatches)
+    with pytest.raises(ValueError) as error:
+        setup(config, recurrent=recurrent)
+    for word in words:
+        assert word in str(error.value)
+
+
+def test_segments_count_in_minibatches_and_are_not_for_recurrent_networks():
+    config = dataclasses.replace(CONFIG, segment_length=8, num_minibatches=16)
+    with pytest.raises(ValueError, match="num_envs \\* rollout_length / segment_length = 12"):
+        setup(config)
+    with pytest.raises(ValueError, match="segment_length is 8, and the network is recurrent"):
+        setup(config, recurrent=True)
+
+
+@pytest.mark.parametrize("recurrent", [False, True])
+def test_on_a_gpu_an_update_is_two_programs_that_make_the_same(recurrent, monkeypatch):
+    env, network, state = setup(recurrent=recurrent)
+    expected, metrics = UPDATE(CONFIG, env, network, state)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    programs = compilation.compile_programs(CONFIG, env, network, Evaluation(number=0), fresh=False)
+    assert set(programs.seconds) == {"collect", "improve"}
+    updated, seen = programs.update(jax.tree.map(jnp.copy, state))
+    leaves = jax.tree.leaves((seen, updated.params, updated.optimizer, updated.env.physics))
+    originals = jax.tree.leaves(
+        (metrics, expected.params, expected.optimizer, expected.env.physics)
+    )
+    for x, y in zip(leaves, originals, strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5)

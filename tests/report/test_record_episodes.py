@@ -1,0 +1,134 @@
+"""`python -m experiments.record_episodes RUN`: its arrays are the run's policy, step by step."""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments import record_episodes
+from purerl import evaluate, run
+from purerl.core.errors import UserError
+from purerl.ppo import running_moments
+from purerl.ppo.networks import GaussianHead
+from purerl.runs import run_folder
+
+TRAIN = """
+import dataclasses
+from experiments.cartpole_swingup import experiment
+from purerl.ppo.config import Config
+from purerl.ppo.networks import MlpOptions, RecurrentOptions, mlp, recurrent
+
+ppo = Config(
+    num_steps=1600, num_envs=4, rollout_length=50, num_minibatches=2, episode_length=30,
+    action_repeat=4,
+)
+experiment = dataclasses.replace(experiment, ppo=ppo, build_network={build}, network={network})
+"""
+MLP = "MlpOptions(policy_hidden=(5,), value_hidden=(6,), std='state')"
+LSTM = "RecurrentOptions(cell='lstm', hidden=3, encoder=(4,), value_hidden=(4,))"
+
+
+class Recorded(NamedTuple):
+    folder: Path
+    arrays: dict[str, np.ndarray]
+    state: Any
+
+
+def train_and_record(place: Path, build: str, network: str) -> Recorded:
+    file, out = place / "mine.py", place / "out.npz"
+    file.write_text(TRAIN.format(build=build, network=network))
+    assert run.main([str(file), "--runs", str(place / "runs")]) == 0
+    folder = place / "runs" / "mine" / "seed1"
+    words = ["--episodes", "3", "--seed", "5", "--out", str(out)]
+    assert record_episodes.main([str(folder), *words]) == 0
+    return Recorded(
+        folder, dict(np.load(out)), run_folder.restore(folder, "latest", print).saved.state
+    )
+
+
+@pytest.fixture(scope="module")
+def mlp(tmp_path_factory) -> Recorded:
+    return train_and_record(tmp_path_factory.mktemp("mlp"), "mlp", MLP)
+
+
+@pytest.fixture(scope="module")
+def lstm(tmp_path_factory) -> Recorded:
+    return train_and_record(tmp_path_factory.mktemp("lstm"), "recurrent", LSTM)
+
+
+def test_its_episodes_begin_as_those_of_an_evaluation(lstm, tmp_path):
+    folder, arrays, _ = lstm
+    file = tmp_path / "judged.json"
+    words = ["--episodes", "3", "--seed", "5", "--json", str(file)]
+    assert evaluate.main([str(folder), *words]) == 0
+    judged = json.loads(file.read_text())["metrics"]["episode_return"]["values"]
+    assert arrays["length"].tolist() == [8, 8, 8]  # actions of 4 control steps, in 30
+    assert arrays["reward"].shape == (3, 8) and arrays["action"].shape == (3, 8, 1)
+    np.testing.assert_allclose(arrays["reward"].sum(axis=1), judged, rtol=1e-5)
+
+
+def test_a_layer_is_computed_from_the_observation_beside_it(mlp):
+    """Recomputed from the checkpoint's weights, from the observation to the action."""
+    _, arrays, state = mlp
+    weights = jax.tree.map(np.asarray, state.params["params"])
+    normalized = np.asarray(running_moments.normalize(state.normalizer, arrays["observation"]))
+    layer = normalized @ weights["policy"]["Dense_0"]["kernel"]
+    layer = layer + weights["policy"]["Dense_0"]["bias"]
+    hidden = layer / (1.0 + np.exp(-layer))  # swish
+    loc = hidden @ weights["head"]["loc"]["kernel"] + weights["head"]["loc"]["bias"]
+    close = {"rtol": 1e-4, "atol": 1e-5}
+    np.testing.assert_allclose(arrays["network/policy/Dense_0"], layer, **close)
+    np.testing.assert_allclose(arrays["network/policy"], hidden, **close)
+    np.testing.assert_allclose(arrays["network/head.loc"], loc, **close)
+    np.testing.assert_allclose(arrays["action"], np.tanh(loc), **close)
+    np.testing.assert_allclose(arrays["network/value_out"][..., 0], arrays["value"], rtol=1e-6)
+    # The head's scale and its layer of that name are two things.
+    assert (arrays["network/head.scale"] > 0.0).all()
+    assert not np.array_equal(arrays["network/head.scale"], arrays["network/head/scale"])
+
+
+def test_state_and_observation_are_of_one_moment(mlp):
+    arrays = mlp.arrays
+    position, angle = np.moveaxis(arrays["physics/qpos"], -1, 0)
+    cart, cosine, sine, *_ = np.moveaxis(arrays["observation"], -1, 0)
+    np.testing.assert_allclose(np.stack([position, np.cos(angle), np.sin(angle)]),
+                               np.stack([cart, cosine, sine]), atol=1e-5)  # fmt: skip
+    np.testing.assert_allclose(np.diff(arrays["physics/time"]), 4 * 0.02, rtol=1e-4)
+    assert not any(array.size == 0 for array in arrays.values())
+
+
+def test_a_memory_is_what_the_step_before_left(lstm):
+    arrays = lstm.arrays
+    for i in (0, 1):
+        memory = arrays[f"memory/{i}"]
+        assert (memory[:, 0] == 0.0).all() and (memory[:, 1] != 0.0).all()
+        left = arrays[f"network/cell.0.{i}"][:, :-1]
+        # XLA computes it once to be noted and once to be kept, and may round each otherwise.
+        np.testing.assert_allclose(memory[:, 1:], left, rtol=1e-6, atol=1e-7)
+
+
+def test_a_module_that_is_applied_twice_is_noted_twice():
+    class Twice(nn.Module):
+        @nn.compact
+        def __call__(self, x):
+            both = GaussianHead(2, "learned", 0.5)
+            return both(x), both(x + 1.0)
+
+    module, x = Twice(), jnp.ones(3)
+    params, noted = module.init(jax.random.key(0), x), {}
+    with nn.intercept_methods(record_episodes.note_modules(noted)):
+        first, second = module.apply(params, x)
+    head = "GaussianHead_0"
+    np.testing.assert_array_equal(noted[f"{head}.loc"], first.loc)
+    np.testing.assert_array_equal(noted[f"{head}.loc_again"], second.loc)
+    np.testing.assert_array_equal(noted[f"{head}/loc_again"], second.loc)
+
+
+def test_a_mistake_is_one_line(mlp):
+    with pytest.raises(UserError, match="episodes is 0; it must be at least 1"):
+        record_episodes.main([str(mlp.folder), "--episodes", "0"])

@@ -1,0 +1,435 @@
+"""`python -m purerl.render RUN`, and `--video` of a run. Needs OpenGL (libosmesa6)."""
+
+import dataclasses
+import json
+import shutil
+import sys
+import time
+from pathlib import Path
+
+import imageio_ffmpeg
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from PIL import Image
+
+from envs import cartpole_swingup
+from purerl import render, run
+from purerl.core.errors import FAILURE, USAGE, RunError
+from purerl.core.keys import per_environment
+from purerl.report import episode_pictures
+from purerl.report import renderer as drawing
+from purerl.runs import video_process
+from purerl.runs.run_folder import restore
+from tests import quick
+
+TINY = "--ppo.num-envs 4 --ppo.rollout-length 8 --ppo.num-steps 96 --ppo.num-minibatches 2"
+TINY += " --ppo.episode-length 60 --evaluation.num-episodes 2 --evaluation.number 1"
+
+
+def train(place: Path, name: str, *words: str) -> Path:
+    arguments = ["cartpole_swingup", "--runs", str(place), "--name", name, *TINY.split(), *words]
+    assert run.main(arguments) == 0
+    return place / "cartpole_swingup" / name
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("render")
+
+
+@pytest.fixture(scope="module")
+def trained(place) -> Path:
+    return train(place, "plain")
+
+
+def read_video(path: Path) -> tuple[dict, np.ndarray]:
+    reader = imageio_ffmpeg.read_frames(str(path))
+    about = next(reader)
+    width, height = about["size"]
+    frames = [np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in reader]
+    return about, np.stack(frames)
+
+
+def only_line(capsys) -> str:
+    said = capsys.readouterr().err.strip()
+    assert len(said.splitlines()) == 1 and "Traceback" not in said
+    return said
+
+
+# --- files ---
+
+
+def test_video_and_sheet_show_the_episode_in_real_time(trained, capsys):
+    words = ["--size", "160x120", "--seconds", "0.8", "--episodes", "2"]
+    assert render.main([str(trained), *words]) == 0
+    about, frames = read_video(trained / "videos" / "000000000003.mp4")
+    assert about["size"] == (160, 120) and about["fps"] == 50.0
+    assert len(frames) == 2 * (1 + 40)  # 0.8 s of 20 ms, and the start, twice
+    assert np.abs(frames[0].astype(int) - frames[40]).max() > 60  # the pole has moved
+    assert np.abs(frames[0].astype(int) - frames[41]).mean() < 3  # and hangs again
+    with Image.open(trained / "videos" / "000000000003.png") as sheet:
+        assert sheet.size == (4 * 320, 4 * 240)
+        cells = np.asarray(sheet, int)
+    assert np.abs(cells[:240, :320] - cells[240:480, 960:]).max() > 60
+    said = capsys.readouterr().out
+    assert "update 3, episode 2: 0.8 s (cut there)" in said and "000000000003.mp4" in said
+
+
+def test_what_is_not_the_default_stands_in_the_name(trained, capsys):
+    words = ["--size", "64x48", "--seed", "3", "--camera", "front"]
+    assert render.main([str(trained), *words]) == 0
+    _, frames = read_video(trained / "videos" / "000000000003_front_seed3.mp4")
+    assert len(frames) == 61  # the whole episode
+    assert "1.2 s (to its end)" in capsys.readouterr().out
+
+
+# --- the episode ---
+
+
+def test_states_are_those_of_the_policy_with_repeated_actions(trained):
+    found = restore(trained, "latest", print)
+    _, env, network, _ = found.setup
+    config = dataclasses.replace(found.setup.config, action_repeat=3, episode_length=7)
+    state, key = found.saved.state, jax.random.key(5)
+    recording = jax.jit(lambda s: episode_pictures.record(config, env, network, s, key, 2, 8))(
+        state
+    )
+    assert recording.shown.shape == (10, 2)  # 3 actions of 3 steps
+    assert recording.shown.sum(0).tolist() == [8, 8] and recording.over.all()
+    assert recording.length.tolist() == [7, 7]
+
+    step = quick.jit(env.step)
+    expected = env.reset(per_environment(key, 2)[1])
+    total = 0.0
+    for t in range(7):
+        assert np.allclose(recording.pictures.qpos[t, 1], expected.physics.qpos, atol=1e-5)
+        if t % 3 == 0:
+            statistics = state.normalizer
+            observation = episode_pictures.act(
+                network, state.params, statistics, jax.tree.map(lambda x: x[None], expected), ()
+            )[0].distribution.loc
+            action = config.action_distribution.to_action(observation)[0]
+        expected = step(expected, action)
+        total += float(expected.reward)
+    assert float(recording.episode_return[1]) == pytest.approx(total, abs=1e-4)
+
+
+@dataclasses.dataclass(frozen=True)
+class Stretched:
+    """A cart-pole whose cart is of another size in every episode."""
+
+    inner: cartpole_swingup.CartpoleSwingup
+    action_size = 1
+    control_timestep = 0.02
+
+    @property
+    def physics(self):
+        return self.inner.physics
+
+    def reset(self, key):
+        inner, own = jax.random.split(key)
+        state = self.inner.reset(inner)
+        return state.replace(task=jax.random.uniform(own, (), minval=0.1, maxval=0.5))
+
+    def step(self, state, action):
+        return self.inner.step(state.replace(task=()), action).replace(task=state.task)
+
+    def model_changes(self, state):
+        size = jnp.asarray(self.physics.model.geom_size, jnp.float32)
+        return {"geom_size": size.at[1, 0].set(state.task)}
+
+    def scenery(self, state):
+        return jnp.full((1, 3), state.task), jnp.ones((1, 3))
+
+
+def test_each_episode_keeps_the_geometry_it_had(trained):
+    found = restore(trained, "latest", print)
+    config, env, network, _ = found.setup
+    recording = jax.jit(
+        lambda s: episode_pictures.record(
+            config, Stretched(env), network, s, jax.random.key(0), 3, 4
+        )
+    )(found.saved.state)
+    widths = np.asarray(recording.pictures.changes["geom_size"])[:, :, 1, 0]
+    assert widths.shape == (5, 3) and len(set(widths[0])) == 3
+    assert (widths == widths[0]).all()
+    assert recording.pictures.scenery[0].shape == (5, 3, 1, 3)
+    last = episode_pictures.episode_pictures(jax.device_get(recording), 2, 3)
+    assert len(last) == 3 and last[-1].changes["geom_size"][1, 0] == widths[0, 2]  # 0, 3 and 4
+
+
+@pytest.mark.parametrize(
+    "timestep, stride", [(0.1, 1), (0.02, 1), (0.015, 2), (0.01, 2), (0.005, 4), (0.0025, 8)]
+)
+def test_a_video_has_at_most_50_frames_a_second(timestep, stride):
+    assert episode_pictures.frame_stride(timestep) == stride
+
+
+# --- drawing ---
+
+ROOM = """
+<mujoco>
+  <worldbody>
+    <light pos="0 -3 3" dir="0 1 -1"/>
+    {cameras}
+    <geom name="ground" type="plane" size="5 5 1" rgba="0.2 0.6 0.2 1"/>
+    <body name="ball" pos="0 0 1">
+      {joint}
+      <geom name="ball" size="0.2" rgba="1 0 0 1"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+TRACK = "<camera name='{}' mode='trackcom'/>"
+
+
+def room(joint="<freejoint/>", cameras=""):
+    return mujoco.MjModel.from_xml_string(ROOM.format(joint=joint, cameras=cameras))
+
+
+def picture(model, qpos=None, changes=None, scenery=()):
+    qpos = model.qpos0 if qpos is None else np.asarray(qpos, float)
+    return episode_pictures.Picture(
+        qpos, np.zeros((0, 3)), np.zeros((0, 4)), changes or {}, scenery
+    )
+
+
+def reddish(frame: np.ndarray) -> np.ndarray:
+    return (frame[..., 0] > 60) & (frame[..., 1] < 0.5 * frame[..., 0].astype(float))
+
+
+def test_changed_geometry_shows():
+    model = room()
+    bigger = {"geom_size": np.array([[5, 5, 1], [0.4, 0, 0]])}
+    # The ball coincides with its body, so the compiler told MuJoCo not to read this.
+    moved = {"geom_pos": np.array([[0, 0, 0], [0.5, 0, 0]])}
+    usual = {"geom_size": model.geom_size.copy(), "geom_pos": model.geom_pos.copy()}
+    with drawing.Renderer(model, 160, 120) as renderer:
+        plain = renderer.draw(picture(model))
+        large = renderer.draw(picture(model, changes=usual | bigger))
+        aside = renderer.draw(picture(model, changes=usual | moved))
+        again = renderer.draw(picture(model, changes=usual))
+    assert reddish(plain).sum() > 50
+    assert reddish(large).sum() > 2.5 * reddish(plain).sum()
+    columns = np.nonzero(reddish(aside))[1].mean() - np.nonzero(reddish(plain))[1].mean()
+    assert columns > 20  # +x is to the right
+    assert (again == plain).all()
+    assert model.geom_size[1, 0] == 0.2  # the environment's own model is left alone
+
+
+def test_scenery_shows_and_is_forgotten():
+    model = room()
+    wall = (np.array([[0.0, -0.5, 1.0]]), np.array([[0.3, 0.05, 0.3]]))
+    with drawing.Renderer(model, 160, 120) as renderer:
+        plain = renderer.draw(picture(model))
+        hidden = renderer.draw(picture(model, scenery=wall))
+        assert (renderer.draw(picture(model)) == plain).all()
+    assert reddish(hidden).sum() == 0
+
+
+def test_furniture_is_not_what_the_camera_follows():
+    shelf = "<body name='shelf'><geom size='1'/><body><geom size='1'/></body></body>"
+    robot = "<body name='robot'><freejoint/><geom size='.1'/></body>"
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><worldbody>{shelf}{robot}</worldbody></mujoco>"
+    )
+    assert model.body(drawing.root_body(model)).name == "robot"
+
+
+def test_the_camera_follows_a_free_body_along_the_ground():
+    model = room()
+    start = [0, 0, 1, 1, 0, 0, 0]
+    with drawing.Renderer(model, 160, 120) as renderer:
+        near = reddish(renderer.draw(picture(model, start)))
+        far = reddish(renderer.draw(picture(model, [3, 2, 1, 1, 0, 0, 0])))
+        risen = reddish(renderer.draw(picture(model, [3, 2, 1.3, 1, 0, 0, 0])))
+    middle = [np.argwhere(mask).mean(0) for mask in (near, far, risen)]
+    assert np.abs(middle[0] - [60, 80]).max() < 3
+    assert np.abs(middle[1] - middle[0]).max() < 2
+    assert middle[2][0] < middle[0][0] - 10  # up in the picture, which is not upside down
+
+
+@pytest.mark.parametrize(
+    "joint, cameras, expected",
+    [
+        ("<freejoint/>", "<camera name='still'/>", None),
+        ("<joint type='slide'/>", "<camera name='still'/>", "still"),
+        ("<joint type='slide'/>", "", None),
+        ("<freejoint/><camera name='eye'/>" + TRACK.format("back"), "<camera name='s'/>", "back"),
+        ("<freejoint/>" + TRACK.format("back") + TRACK.format("side"), "", "side"),
+        ("<joint type='hinge'/>" + TRACK.format("hand"), "<camera name='still'/>", "still"),
+    ],
+)
+def test_the_default_camera_is_the_one_that_follows(joint, cameras, expected):
+    model = room(joint, cameras)
+    chosen = drawing.default_camera(model)
+    assert (None if chosen is None else model.camera(chosen).name) == expected
+
+
+# --- mistakes ---
+
+
+def test_an_unknown_camera_or_checkpoint_lists_those_there_are(trained, capsys):
+    assert render.main([str(trained), "--camera", "frot"]) == USAGE
+    said = only_line(capsys)
+    assert "'frot'" in said and "Did you mean 'front'?" in said
+    assert render.main([str(trained), "--checkpoint", "77"]) == USAGE
+    assert "Valid: latest, best, 1, 2, 3" in only_line(capsys)
+
+
+@pytest.mark.parametrize(
+    "words, part",
+    [
+        (["--size", "large"], "such as 640x480"),
+        (["--size", "161x120"], "even"),
+        (["--size", "0x0"], "16"),
+        (["--episodes", "0"], "at least 1"),
+        (["--seconds", "nan"], "at least 0.1"),
+        (["--sise", "64x64"], "--size"),
+    ],
+)
+def test_a_wrong_option_is_one_line(trained, words, part, capsys):
+    assert render.main([str(trained), *words]) == USAGE
+    assert part in only_line(capsys)
+
+
+def test_no_run_and_no_physics_are_one_line(tmp_path, capsys):
+    assert render.main([str(tmp_path)]) == USAGE
+    assert "no config.json" in only_line(capsys)
+    toy = Path(__file__).parent.parent / "runs" / "toy_experiment.py"
+    assert run.main([str(toy), "--runs", str(tmp_path)]) == 0
+    capsys.readouterr()
+    assert render.main([str(tmp_path / "toy_experiment" / "seed1")]) == USAGE
+    assert "cannot be drawn" in only_line(capsys)
+
+
+def test_settings_of_another_version_are_named(trained, tmp_path, capsys):
+    copy = tmp_path / "run"
+    shutil.copytree(trained, copy)
+    settings = json.loads((copy / "config.json").read_text())
+    settings["settings"]["env"]["gravity"] = 9.81
+    (copy / "config.json").write_text(json.dumps(settings))
+    assert render.main([str(copy)]) == USAGE
+    assert "env.gravity" in only_line(capsys)
+
+
+def test_without_opengl_one_line_says_what_to_install(trained, monkeypatch, capsys):
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    assert render.main([str(trained)]) == FAILURE
+    assert "MUJOCO_GL" in only_line(capsys)
+    monkeypatch.delenv("MUJOCO_GL")
+    with pytest.raises(RunError, match="apt-get install libosmesa6"):
+        drawing.choose_gl(find=lambda name: None)
+
+
+def test_a_backend_that_does_not_start_says_what_to_install(monkeypatch):
+    import mujoco.osmesa
+
+    class Broken:
+        def __init__(self, *_):
+            raise ImportError("no driver")
+
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    monkeypatch.setenv("PYOPENGL_PLATFORM", "osmesa")
+    monkeypatch.setattr(mujoco.osmesa, "GLContext", Broken)
+    with pytest.raises(RunError, match="osmesa .ImportError.*apt-get install libosmesa6"):
+        drawing.open_gl(64, 48)
+
+
+def test_files_that_cannot_be_written_are_one_line(trained, tmp_path, capsys):
+    copy = tmp_path / "run"
+    shutil.copytree(trained, copy, ignore=shutil.ignore_patterns("videos"))
+    (copy / "videos").touch()
+    words = ["--size", "64x48", "--seconds", "0.1"]
+    assert render.main([str(copy), *words]) == FAILURE
+    assert "cannot be written" in only_line(capsys)
+    (copy / "videos").unlink()
+    assert render.main([str(copy), *words]) == 0
+    assert len(list((copy / "videos").iterdir())) == 2  # no draft is left
+
+
+# --- while training ---
+
+
+def test_a_run_makes_a_video_and_learns_the_same(trained, place, capsys):
+    folder = train(place, "with-video", "--video")
+    assert "Video: " in capsys.readouterr().out
+    _, frames = read_video(folder / "videos" / "000000000003.mp4")
+    assert len(frames) == 61
+
+    def lines(path):
+        read = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+        return [{k: v for k, v in line.items() if k != "wall_s"} for line in read]
+
+    assert lines(folder) == lines(trained)
+    assert "digest" in lines(folder)[-1]
+
+
+class Stage:
+    """A run's folder and what `RunVideo` sees of it."""
+
+    def __init__(self, folder: Path, script: str) -> None:
+        self.folder, self.said, self.stopped, self.started = folder, [], False, 0
+        self.script = script
+        self.video = video_process.RunVideo(
+            folder, lambda: self.stopped, self.said.append, self.command
+        )
+
+    def command(self, folder: Path) -> list[str]:
+        self.started += 1
+        return [sys.executable, "-c", self.script]
+
+    def evaluate(self, update: int, saved: bool = True) -> None:
+        if saved:
+            (self.folder / "checkpoints" / f"{update:012d}").mkdir(parents=True)
+        self.video.log({"update": update, "eval/episode_return": 1.0})
+
+
+def wait(stage: Stage) -> None:
+    process = stage.video.process
+    assert process is not None
+    process.wait(20)
+
+
+def test_one_video_at_a_time_and_the_newest_next(tmp_path):
+    stage = Stage(tmp_path, "import time; time.sleep(0.5); print('there.mp4')")
+    stage.evaluate(1, saved=False)
+    assert stage.started == 0  # nothing to show yet
+    stage.evaluate(2)
+    for update in (3, 4, 5):
+        stage.evaluate(update)
+    assert stage.started == 1
+    wait(stage)
+    stage.video.log({"update": 6})
+    assert stage.started == 2 and stage.said == ["Video: there.mp4"]
+    stage.video.close()
+    stage.video.close()
+    assert stage.started == 2 and stage.video.process is None
+    assert stage.said[1:] == [
+        "Waiting for the last video; Ctrl-C leaves it out.",
+        "Video: there.mp4",
+    ]
+
+
+def test_a_failure_is_told_once_and_ends_it(tmp_path):
+    stage = Stage(tmp_path, "import sys; sys.exit('purerl: There is no OpenGL to draw with.')")
+    stage.evaluate(1)
+    wait(stage)
+    for update in (2, 3):
+        stage.evaluate(update)
+    stage.video.close()
+    assert stage.started == 1 and len(stage.said) == 1
+    assert "There is no OpenGL to draw with. Training goes on." in stage.said[0]
+
+
+def test_a_stopped_run_does_not_wait_for_it(tmp_path):
+    stage = Stage(tmp_path, "import time; time.sleep(60)")
+    stage.evaluate(1)
+    process = stage.video.process
+    stage.stopped = True
+    begin = time.monotonic()
+    stage.video.close()
+    assert time.monotonic() - begin < 5 and process.returncode not in (None, 0)

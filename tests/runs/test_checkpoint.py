@@ -1,0 +1,197 @@
+"""Checkpoints: exact, checked leaf by leaf, and never trusted when damaged."""
+
+import errno
+import hashlib
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from purerl.core.errors import UserError
+from purerl.runs import array_files, checkpoint, state_arrays
+
+
+def make_state(number: float = 1.0):
+    return {
+        "params": {"w.x": jnp.full((30, 4), number), "half": jnp.ones(3, jnp.bfloat16)},
+        "key": jax.random.key(3),
+        "keys": jax.random.split(jax.random.key(4), 2),
+        "empty": jnp.zeros((0, 3)),
+        "counts": (jnp.int32(7), None, jnp.bool_(True), jnp.uint32(2**32 - 1)),
+    }
+
+
+def abstract():
+    return jax.eval_shape(make_state)
+
+
+def save(folder: Path, update: int, number: float | None = None, score: float | None = None):
+    leaves = state_arrays.flatten(make_state(float(update) if number is None else number))
+    meta = {"update": update, "digest": state_arrays.digest_leaves(leaves), "eval_return": score}
+    return checkpoint.save(folder, leaves, meta)
+
+
+def largest_file(path: Path) -> Path:
+    """Returns the file with the arrays of a checkpoint."""
+    return max(
+        (f for f in (path / "state").rglob("*") if f.is_file()), key=lambda f: f.stat().st_size
+    )
+
+
+def test_a_state_comes_back_bit_for_bit(tmp_path):
+    state = make_state(0.1)
+    saved = checkpoint.load(save(tmp_path, 5, 0.1), abstract())
+    assert saved.meta["update"] == 5
+    assert jax.tree.structure(saved.state) == jax.tree.structure(state)
+    assert state_arrays.digest(saved.state) == state_arrays.digest(state) == saved.meta["digest"]
+    for old, new in zip(jax.tree.leaves(state), jax.tree.leaves(saved.state), strict=True):
+        assert old.dtype == new.dtype and old.shape == new.shape
+    draw = jax.random.normal(state["key"], (3,))
+    np.testing.assert_array_equal(draw, jax.random.normal(saved.state["key"], (3,)))
+
+
+def test_the_digest_is_what_its_definition_says():
+    leaves = {"b": np.arange(3, dtype=np.int32), "a": np.zeros((2, 0), np.float32)}
+    text = b"a\0float32\0(2, 0)\0" + b"b\0int32\0(3,)\0" + np.arange(3, dtype=np.int32).tobytes()
+    assert state_arrays.digest_leaves(leaves) == hashlib.sha256(text).hexdigest()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda s: s | {"counts": (jnp.int32(8), *s["counts"][1:])},
+        lambda s: s | {"key": jax.random.key(4)},
+        lambda s: s | {"key": jax.random.key(3, impl="rbg")},
+        lambda s: s | {"empty": jnp.zeros((0, 4))},
+        lambda s: s | {"counts": (jnp.uint32(7), *s["counts"][1:])},
+        lambda s: {("other" if k == "keys" else k): v for k, v in s.items()},
+    ],
+)
+def test_the_digest_sees_every_kind_of_change(change):
+    assert state_arrays.digest(change(make_state())) != state_arrays.digest(make_state())
+
+
+def test_flatten_copies():
+    # On a CPU a jax.Array hands out a read-only view of its buffer, which donation may overwrite.
+    for path, array in state_arrays.flatten(make_state()).items():
+        assert array.flags.owndata and array.flags.writeable, path
+
+
+def test_a_flipped_bit_is_noticed_and_its_leaf_named(tmp_path, monkeypatch):
+    # Orbax compresses small leaves, so a flip in the file may break more than one; the arrays that
+    # it hands back are the place to flip exactly one.
+    path = save(tmp_path, 1)
+    read = array_files.read
+
+    def flipped(*arguments):
+        leaves = read(*arguments)
+        leaves["params/w.x"].view(np.uint8).reshape(-1)[17] ^= 4
+        return leaves
+
+    monkeypatch.setattr(array_files, "read", flipped)
+    with pytest.raises(checkpoint.DamagedError, match="params/w.x"):
+        checkpoint.load(path, abstract())
+
+
+def test_no_flipped_bit_of_any_array_file_loads_as_something_else(tmp_path):
+    path = save(tmp_path, 1)
+    good = state_arrays.digest(make_state(1.0))
+    file = largest_file(path)
+    content = file.read_bytes()
+    noticed = 0
+    for place in np.random.default_rng(0).integers(len(content) * 8, size=20):
+        damaged = bytearray(content)
+        damaged[place // 8] ^= 1 << (place % 8)
+        file.write_bytes(damaged)
+        try:
+            assert state_arrays.digest(checkpoint.load(path, abstract()).state) == good
+        except checkpoint.DamagedError:
+            noticed += 1
+    assert noticed > 0
+
+
+def damage_cut(path: Path):
+    file = largest_file(path)
+    file.write_bytes(file.read_bytes()[:10])
+
+
+def damage_meta(path: Path):
+    file = path / "meta" / "metadata"
+    file.write_text(file.read_text().replace('"update": 2', '"update": 3'))
+
+
+def damage_no_meta(path: Path):
+    (path / "meta" / "metadata").unlink()
+
+
+def damage_empty(path: Path):
+    checkpoint.shutil.rmtree(path)
+    path.mkdir()
+
+
+@pytest.mark.parametrize("damage", [damage_cut, damage_meta, damage_no_meta, damage_empty])
+def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_used(tmp_path, damage):
+    save(tmp_path, 1)
+    damage(save(tmp_path, 2))
+    said = []
+    saved = checkpoint.newest(tmp_path, abstract(), said.append)
+    assert saved.meta["update"] == 1
+    assert state_arrays.digest(saved.state) == state_arrays.digest(make_state(1.0))
+    assert len(said) == 1 and "update 2" in said[0] and "damaged-0-000000000002" in said[0]
+    assert checkpoint.updates(tmp_path) == [1]
+    assert (tmp_path / "damaged-0-000000000002").is_dir()
+
+
+def test_a_reader_sets_nothing_aside(tmp_path):
+    damage_cut(save(tmp_path, 2))
+    assert checkpoint.newest(tmp_path, abstract(), lambda line: None, set_aside=False) is None
+    assert checkpoint.updates(tmp_path) == [2]
+
+
+def test_another_state_is_refused_with_the_leaf(tmp_path):
+    path = save(tmp_path, 1)
+    other = jax.eval_shape(lambda: make_state() | {"empty": jnp.zeros((2, 3))})
+    with pytest.raises(UserError, match="leaf empty is .*0, 3.* in it and .*2, 3"):
+        checkpoint.load(path, other)
+
+
+def test_the_newest_and_the_best_are_kept(tmp_path):
+    for update, score in [(1, None), (2, 9.0), (3, 1.0), (4, None), (5, 2.0)]:
+        save(tmp_path, update, score=score)
+    checkpoint.retain(tmp_path, 2)
+    assert checkpoint.updates(tmp_path) == [2, 4, 5]
+    assert checkpoint.best_update(tmp_path) == 2
+    assert not list(tmp_path.glob(".deleting*"))
+
+
+def test_of_seeds_together_those_are_kept_that_all_have(tmp_path):
+    ahead, behind = tmp_path / "ahead", tmp_path / "behind"
+    for update in (1, 2, 3, 4):
+        save(ahead, update)
+    for update in (1, 2):
+        save(behind, update)
+    for folder in (ahead, behind):
+        checkpoint.retain(folder, 1, [ahead, behind])
+    assert checkpoint.updates(ahead) == [2, 3, 4] and checkpoint.updates(behind) == [2]
+    found = checkpoint.newest_of_all([ahead, behind], abstract(), print)
+    assert [saved.meta["update"] for saved in found] == [2, 2]
+    checkpoint.forget_after(ahead, 2)
+    assert checkpoint.updates(ahead) == [2]
+    damage_cut(behind / f"{2:012d}")
+    assert checkpoint.newest_of_all([ahead, behind], abstract(), print) == []
+    assert checkpoint.updates(ahead) == [2]
+
+
+def test_a_failed_save_leaves_nothing_and_the_older_one_whole(tmp_path, monkeypatch):
+    save(tmp_path, 1)
+    (tmp_path / ".deleting-000000000000").mkdir()  # of an earlier crash
+
+    def full(path):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(array_files, "flush", full)
+    with pytest.raises(OSError, match="No space"):
+        save(tmp_path, 2)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["000000000001"]

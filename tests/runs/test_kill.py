@@ -1,0 +1,17 @@
+"""A few kills at random moments; `python -m tests.checks.kills` makes as many as you like."""
+
+import pytest
+
+from tests.checks.kills import kill_many
+from tests.runs.test_run import TOY
+
+LONG = [str(TOY), "--ppo.num-steps", "4800", "--checkpoints", "15"]
+
+
+@pytest.mark.parametrize(
+    ("words", "kills"),
+    [(LONG, 2), ([*LONG, "--num-seeds", "3", "--keep", "1"], 2)],
+    ids=["one run", "vmapped seeds"],
+)
+def test_killed_runs_end_as_undisturbed_ones(tmp_path, words, kills):
+    assert kill_many(words, kills, seed=5, runs=tmp_path / "runs")

@@ -1,0 +1,123 @@
+"""Loggers: metrics.jsonl is exact, the others can do no harm."""
+
+import json
+import threading
+import time
+
+import pytest
+
+from purerl.core.errors import UserError
+from purerl.runs.loggers import BackgroundLogger, MetricsFile, TensorBoardSink, summarize
+
+
+def test_counts_are_summed_and_episodes_weigh_by_their_number():
+    names = ("episodes", "episode_return", "episode/x", "kl", "skipped_in_a_row")
+    rows = [
+        (1.0, 10.0, 1.0, 1.0, 4.0),
+        (3.0, 2.0, 5.0, 2.0, 0.0),
+        (0.0, float("nan"), 0.0, 6.0, 2.0),
+    ]
+    window = [dict(zip(names, row, strict=True)) for row in rows]
+    assert summarize(window) == {
+        "episodes": 4.0,
+        "episode_return": 4.0,
+        "episode/x": 4.0,
+        "kl": 3.0,
+        "skipped_in_a_row": 2.0,
+    }
+
+
+def test_nothing_is_said_of_episodes_when_none_ended():
+    assert summarize([{"episodes": 0.0, "episode_return": 0.0}])["episode_return"] is None
+
+
+def test_lines_are_whole_and_strict_json(tmp_path):
+    file = MetricsFile(tmp_path / "m", 0)
+    first = file.append({"a": float("nan"), "b": 1})
+    file.append({"a": float("inf"), "b": 2})
+    lines = (tmp_path / "m").read_bytes().splitlines(keepends=True)
+    assert first == len(lines[0])
+    assert [json.loads(line) for line in lines] == [{"a": None, "b": 1}, {"a": None, "b": 2}]
+    MetricsFile(tmp_path / "m", first)
+    assert (tmp_path / "m").read_bytes() == lines[0]
+
+
+def test_a_shortened_file_is_refused(tmp_path):
+    (tmp_path / "m").write_text("{}\n")
+    with pytest.raises(UserError, match="3 bytes.*after 10"):
+        MetricsFile(tmp_path / "m", 10)
+
+
+def test_a_full_disk_leaves_no_gap_and_no_torn_line(tmp_path):
+    file = MetricsFile(tmp_path / "m", 0)
+    file.append({"n": 1})
+    raw, room = file.file, [3]
+
+    class Full:
+        truncate = raw.truncate
+
+        def write(self, content):
+            if room:
+                return raw.write(content[: room.pop()])
+            raise OSError("No space left on device")
+
+    file.file = Full()
+    for number in (2, 3):
+        with pytest.raises(OSError):
+            file.append({"n": number})
+        assert (tmp_path / "m").read_text() == '{"n": 1}\n'
+    file.file = raw
+    file.append({"n": 4})
+    assert (tmp_path / "m").read_text() == "".join(f'{{"n": {n}}}\n' for n in (1, 2, 3, 4))
+
+
+class Sink:
+    def __init__(self, log=lambda record: None):
+        self.log, self.closed = log, False
+
+    def close(self):
+        self.closed = True
+
+
+def test_a_logger_gets_every_record_and_is_closed():
+    got = []
+    sink = Sink(got.append)
+    logger = BackgroundLogger("T", lambda: sink, pytest.fail)
+    for number in range(5):
+        logger.log({"n": number})
+    logger.close()
+    assert got == [{"n": n} for n in range(5)] and sink.closed
+
+
+def test_a_logger_that_raises_is_dropped_once():
+    said = []
+
+    def fail(record):
+        raise RuntimeError("no network to be found")
+
+    logger = BackgroundLogger("T", lambda: Sink(fail), said.append)
+    for _ in range(3):
+        logger.log({})
+        logger.thread.join(1.0)
+    logger.close()
+    assert said == ["The T logger is dropped: no network to be found. Training goes on."]
+
+
+def test_a_logger_that_hangs_never_makes_training_wait():
+    said, release = [], threading.Event()
+    logger = BackgroundLogger("T", lambda: Sink(lambda record: release.wait(20)), said.append, 4)
+    begin = time.perf_counter()
+    for _ in range(100):
+        logger.log({})
+    logger.close()
+    assert time.perf_counter() - begin < 1.0
+    assert len(said) == 1 and "too slow" in said[0]
+    release.set()
+
+
+def test_tensorboard_files_are_written(tmp_path):
+    pytest.importorskip("tensorboardX")
+    sink = TensorBoardSink(tmp_path, 0)
+    sink.log({"update": 1, "train/kl": 0.5, "eval/x": None})
+    sink.close()
+    assert b"train/kl" in next((tmp_path / "tensorboard").iterdir()).read_bytes()
