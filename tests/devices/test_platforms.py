@@ -11,9 +11,9 @@ from tests.runs.test_run import TOY
 
 def test_what_is_learned_otherwise_is_named(tmp_path, monkeypatch):
     file = tmp_path / "there.npz"
-    platforms_check.ask_cpu([str(TOY), "--write", str(file)])
+    platforms.ask_cpu([str(TOY), "--write", str(file)])
     setup, there = build_experiment.build(toy_experiment.experiment), dict(np.load(file))
-    assert platforms_check.compare(setup, there) == {}
+    assert platforms.compare(setup, there) == {}
     improve = algorithm.improve
 
     def wrong(*arguments):
@@ -21,7 +21,7 @@ def test_what_is_learned_otherwise_is_named(tmp_path, monkeypatch):
         return state.replace(params=jax.tree.map(lambda x: x + 0.01, state.params)), metrics
 
     monkeypatch.setattr(algorithm, "improve", wrong)
-    found = platforms_check.compare(setup, there)
+    found = platforms.compare(setup, there)
     assert {path.split("/")[1] for path in found} == {"params"}
     for path, difference in found.items():  # relative to the greatest entry, if that is above 1
         greatest = max(1.0, float(np.abs(there[path]).max()))
