@@ -5,6 +5,7 @@ import numpy as np
 
 from purerl.ppo import algorithm
 from purerl.runs import build_experiment
+from tests.checks import platforms
 from tests.runs import toy_experiment
 from tests.runs.test_run import TOY
 
