@@ -8,8 +8,8 @@ and 3: 16 gaps, 90% and 100%).
 
 from envs import run
 from purerl.ppo import networks
-from purerl.ppo.config import Config
-from purerl.runs.experiment import Evaluation, Experiment
+from purerl.ppo.config import Config, Evaluation
+from purerl.runs.experiment import Experiment
 
 experiment = Experiment(
     build_env=run.build,

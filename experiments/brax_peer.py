@@ -40,9 +40,9 @@ from purerl.core.errors import leave, output_file
 from purerl.core.records import Array, PyTree
 from purerl.devices import compilation
 from purerl.exact import xla_flags
-from purerl.ppo.config import Config
+from purerl.ppo.config import Config, Evaluation
 from purerl.runs import build_experiment
-from purerl.runs.experiment import Evaluation, Experiment
+from purerl.runs.experiment import Experiment
 
 
 @dataclass(frozen=True)

@@ -33,9 +33,9 @@ from purerl.core.errors import UserError, leave, output_file
 from purerl.devices import compilation
 from purerl.devices.compilation import Programs
 from purerl.exact import xla_flags
+from purerl.ppo.config import Evaluation
 from purerl.report import bootstrap
 from purerl.runs import build_experiment
-from purerl.runs.experiment import Evaluation
 
 NUM_EPISODES = 128
 PHYSICS = {"purerl": "purerl", "purerl-on-brax": "mjx"}  # ours -> whose

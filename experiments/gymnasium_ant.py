@@ -6,8 +6,8 @@ python -m purerl.run gymnasium_ant
 
 from envs import gymnasium_ant
 from purerl.ppo import networks
-from purerl.ppo.config import Config
-from purerl.runs.experiment import Evaluation, Experiment
+from purerl.ppo.config import Config, Evaluation
+from purerl.runs.experiment import Experiment
 
 experiment = Experiment(
     build_env=gymnasium_ant.build,

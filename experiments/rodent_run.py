@@ -9,8 +9,8 @@ beside it.
 
 from envs import run
 from purerl.ppo import networks
-from purerl.ppo.config import Config
-from purerl.runs.experiment import Evaluation, Experiment
+from purerl.ppo.config import Config, Evaluation
+from purerl.runs.experiment import Experiment
 
 experiment = Experiment(
     build_env=run.build,

@@ -7,8 +7,8 @@ Expected: return 600 of 1000 after 3 min, on two CPU cores; the other tasks: doc
 
 from envs.suite import tasks
 from purerl.ppo import networks
-from purerl.ppo.config import Config
-from purerl.runs.experiment import Evaluation, Experiment
+from purerl.ppo.config import Config, Evaluation
+from purerl.runs.experiment import Experiment
 
 experiment = Experiment(
     build_env=tasks.build,
@@ -19,7 +19,6 @@ experiment = Experiment(
         num_steps=3_000_000,
         num_envs=128,
         rollout_length=64,
-        reset_pool=16,  # 8 of the 128 episodes of 1000 steps end in an update
         num_epochs=4,
         num_minibatches=8,
         learning_rate=1e-3,

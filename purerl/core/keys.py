@@ -1,13 +1,12 @@
 """Random keys, derived by use: `fold_in` from (seed, purpose, indices), never split in sequence.
 
-A key depends only on what it is for, so no result depends on how often something else was drawn,
-on where a checkpoint was taken, or on how environments are spread over devices.
+A key depends only on what it is for. So no result depends on how often something else was drawn,
+on where a checkpoint was taken, or on which environments are computed together.
 """
 
 import enum
 
 import jax
-import jax.numpy as jnp
 
 from purerl.core.records import Array
 
@@ -32,6 +31,6 @@ def derive(key: Array, purpose: Purpose, *indices: Array | int) -> Array:
     return key
 
 
-def per_environment(key: Array, num_envs: int, first: Array | int = 0) -> Array:
-    """Returns one key per environment [B], by environment index, from `first` on."""
-    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(num_envs) + first)
+def per_environment(key: Array, numbers: Array) -> Array:
+    """Returns one key for each environment, [B], from the environments' `numbers` [B]."""
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, numbers)

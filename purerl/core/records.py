@@ -12,6 +12,7 @@ Shapes, everywhere in this project, time first (`[T, B, ...]`):
 | `H`    | features of a recurrent carry          |
 | `S`    | seeds                                  |
 | `N`    | evaluation episodes                    |
+| `V`    | parts of a batch (`core/parts.py`)     |
 
 `[]` is a scalar, `[...]` any leading batch axes. A docstring that says `[O]` describes one
 environment; the caller's `vmap` adds `[B, O]`.
@@ -57,7 +58,7 @@ class Network(NamedTuple):
 
 
 class Counter(struct.PyTreeNode):
-    """A 64-bit count on devices without 64-bit integers: `high * 2**32 + low`."""
+    """A 64-bit count, `high * 2**32 + low`: JAX has no 64-bit integers by default."""
 
     high: Array  # [] uint32
     low: Array  # [] uint32
@@ -71,8 +72,7 @@ def zero_count() -> Counter:
 def add_count(count: Counter, number: Array) -> Counter:
     """Adds `number` ([] integer, at least 0, below 2**32) exactly."""
     low = count.low + number.astype(jnp.uint32)
-    carry = (low < count.low).astype(jnp.uint32)
-    return Counter(high=count.high + carry, low=low)
+    return Counter(high=count.high + (low < count.low), low=low)
 
 
 def count_as_float(count: Counter) -> Array:
@@ -81,7 +81,7 @@ def count_as_float(count: Counter) -> Array:
 
 
 def count_as_int(count: Counter) -> int:
-    """Returns the exact count as a Python integer (host only)."""
+    """Returns the exact count as a Python integer; not in a traced function."""
     return (int(count.high) << 32) + int(count.low)
 
 
@@ -104,6 +104,7 @@ class TrainState(struct.PyTreeNode):
     normalizer: PyTree  # normalizer.Statistics of the observation
     reward_normalizer: PyTree  # normalizer.Statistics of the discounted return, [] each
     # Where the environments are.
+    number: Array  # [B] int32 each environment's number, which its random keys are folded with
     env: PyTree  # env.State, [B, ...]
     carry: PyTree  # the policy's memory, [B, ...]; () for a feed-forward network
     episode: EpisodeStats  # [B]

@@ -1,13 +1,6 @@
-"""A run's programs: its beginning, an update, the evaluation.
-
-They are compiled at the same time, since XLA does not hold Python's lock; where cores are few, the
-evaluation when it is first needed. An update is two programs, which compile side by side, with the
-`c` engine and on a GPU. With MJX on a CPU it is one: acting alone, 256 ants on two cores, never
-ended (all of XLA's threads waiting, jax 0.10.2), where the whole update does.
-"""
+"""How programs are compiled: the cache, levels of optimisation, side by side in threads."""
 
 import contextlib
-import functools
 import gc
 import os
 import time
@@ -18,43 +11,34 @@ from typing import Any, NamedTuple
 
 import jax
 
-from purerl.core.env import Env
-from purerl.core.records import Array, Metrics, Network, PyTree, TrainState
+from purerl.core.records import Metrics, PyTree
 from purerl.exact.rewrite import list_scatter_sums
-from purerl.ppo import algorithm
-from purerl.ppo.config import Config
-from purerl.ppo.evaluation import evaluate_in_run
-from purerl.runs.experiment import Evaluation
 
-# Compiling takes all of few cores, so that the first update waits for whatever is not needed yet;
-# 16 came to brax's ant's first evaluation on a GPU in 22 s with all side by side, in 39 s else (21
-# November 2026, when its program was smaller).
+# Up to so many cores, the evaluation is compiled when it is first needed, or the first update
+# would wait for it. With 16 cores all is compiled side by side: brax's ant came to its first
+# evaluation on a GPU in 22 s instead of 39.
 FEW_CORES = 7
-# LLVM's level on a CPU, 3 elsewhere: what runs once, or waits for MuJoCo, shall be ready soon. For
-# an ant, `c`, `init` takes 1.5 s of a core instead of 3.3; `collect` 3.9 instead of 4.7
-# and is as fast (at level 0 it takes 2.4, and is slower by 8%).
+# LLVM's optimisation level on a CPU, 3 for all others: a program that runs once, or that waits for
+# MuJoCo, shall be ready soon. For an ant on engine `c`, `init` takes 1.5 s of a core, not 3.3, and
+# `collect` 3.9 s, not 4.7, and it runs as fast (at level 0 it takes 2.4, and is slower by 8%).
 LEVELS = {"init": 0, "collect": 1}
 
 
-class Programs(NamedTuple):
-    """A run's compiled functions; of S vmapped seeds every array has a leading axis [S].
+class Compiling(NamedTuple):
+    """An update that is being compiled."""
 
-    `update` and `evaluate` take a TrainState, or what `spread` makes of one for several devices.
-    """
-
-    init: Callable[[Array], TrainState]
-    update: Callable[[Any], tuple[Any, Metrics]]
-    evaluate: Callable[[Any], Metrics]
-    seconds: dict[str, float]  # that each took to compile, side by side; without the evaluation
-    unordered: list[str]  # sums of the update whose order nothing fixes on a GPU
-    spread: Callable[[TrainState], Any] = lambda state: state  # onto the devices, for the others
-    fetch: Callable[[Any], TrainState] = lambda state: state  # back onto one
+    finish: Callable[[], Callable[[Any], tuple[Any, Metrics]]]  # waits for it, and returns it
+    unordered: list[str]  # its sums without a fixed order
 
 
 def set_up_jax(cache: bool) -> str:
-    """Sets what bits depend on, whatever a later JAX's defaults; returns the cache's folder.
+    """Sets the options of JAX on which bits depend, and the cache of compiled programs.
 
-    Without `cache`, or with JAX_ENABLE_COMPILATION_CACHE=false in the environment, there is none.
+    Args:
+      cache: whether there is one; JAX_ENABLE_COMPILATION_CACHE=false in the environment says no.
+
+    Returns:
+      The cache's folder, or "off".
     """
     jax.config.update("jax_threefry_partitionable", True)
     jax.config.update("jax_default_prng_impl", "threefry2x32")
@@ -77,7 +61,7 @@ def cache_folder() -> Path:
 
 @contextlib.contextmanager
 def no_collection() -> Iterator[None]:
-    """Keeps Python from looking for garbage, of which tracing makes none but millions of objects.
+    """Keeps Python from looking for garbage: tracing makes millions of objects, and no garbage.
 
     An ant's first update with MJX, on two cores, came after 10 s instead of 12.
     """
@@ -88,69 +72,6 @@ def no_collection() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
-
-
-def abstract_state(config: Config, env: Env, network: Network) -> PyTree:
-    """Returns the shapes and dtypes of a run's state without computing anything."""
-    return jax.eval_shape(
-        functools.partial(algorithm.init, config, env, network), jax.random.key(0)
-    )
-
-
-def compile_programs(
-    config: Config,
-    env: Env,
-    network: Network,
-    evaluation: Evaluation,
-    fresh: bool,
-    vmapped_seeds: int = 1,
-    calls_host: bool = False,
-) -> Programs:
-    """Compiles what a run calls; `init` only for a fresh one, `evaluate` only if planned.
-
-    With `calls_host`, as the `c` engine does, an update is compiled as two programs.
-    """
-    functions: list[Callable[..., Any]] = [
-        # Initialisation is a program too: computed eagerly, its bits are others.
-        functools.partial(algorithm.init, config, env, network),
-        functools.partial(algorithm.update, config, env, network),
-        functools.partial(algorithm.collect, config, env, network),
-        functools.partial(algorithm.improve, config, network),
-        functools.partial(evaluate_in_run, config, env, network, evaluation.num_episodes),
-    ]
-    key = jax.random.key(0)
-    if vmapped_seeds > 1:
-        functions = [jax.vmap(function) for function in functions]
-        key = jax.random.split(key, vmapped_seeds)
-    init, whole, collect, improve, judge = functions
-    abstract = jax.eval_shape(init, key)
-    seconds: dict[str, float] = {}
-    in_halves = calls_host or jax.default_backend() == "gpu"
-    parts = [("collect", collect), ("improve", improve)] if in_halves else [("update", whole)]
-    given, traced, started = (abstract,), [], []
-    for name, part in parts:
-        traced.append(jit(name, part, donate_argnums=0).trace(*given))
-        started.append(start(name, traced[-1], seconds))
-        given = shapes(traced[-1].out_info)
-    begin, evaluate = jit("init", init), jit("evaluation", judge)
-    beginning = start("init", begin.trace(key), seconds) if fresh else None
-    if evaluation.number:
-        evaluate = when_needed("evaluation", evaluate, abstract, seconds)
-    compiled = [part.result() for part in started]
-    return Programs(
-        init=beginning.result() if beginning else begin,
-        update=functools.partial(update, *compiled) if in_halves else compiled[0],
-        evaluate=evaluate,
-        seconds=dict(seconds),  # the evaluation's may come later
-        unordered=sorted({place for part in traced for place in unordered(part)}),
-    )
-
-
-def update(
-    collect: Callable[..., Any], improve: Callable[..., Any], state: TrainState
-) -> tuple[TrainState, Metrics]:
-    """Makes an update of its two halves, as `ppo.update` does; returns before it is computed."""
-    return improve(*collect(state))
 
 
 def shapes(tree: PyTree, sharding: Any = None) -> PyTree:

@@ -1,8 +1,8 @@
 """Training on several devices: V shards of the environments, shared by D devices.
 
-Two programs make an update. `collect` acts in one shard. It is a program of one device, the very
-same on each and called once for each shard, because a partitioned program's physics has other bits
-than an unpartitioned one's (measured: MJX with contacts). `improve` learns, all devices together.
+Two programs make an update. `collect` acts in one shard: a program of one device, the same on
+each, called once for each shard. (A partitioned program's physics has other bits than that of an
+unpartitioned one; measured: MJX with contacts.) `improve` learns, on all devices together.
 Initialisation and evaluation are programs of one device too.
 """
 
@@ -20,15 +20,22 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDev
 
 from purerl.core.env import Env
 from purerl.core.records import Array, Metrics, Network, PyTree, TrainState
-from purerl.devices.compilation import Programs, jit, shapes, start, unordered, when_needed
-from purerl.devices.shards import AXIS, Shards
+from purerl.devices.compilation import Compiling, shapes, start, unordered
+from purerl.devices.shards import AXIS, Shards, parts_of
+from purerl.devices.slices import count_slices, cut_in_slices
 from purerl.exact import xla_flags
 from purerl.ppo import algorithm
+from purerl.ppo.algorithm import Experience
 from purerl.ppo.config import Config
-from purerl.ppo.evaluation import evaluate_in_run
-from purerl.runs.experiment import Evaluation
+from purerl.ppo.learner import is_recurrent
 
-PLACES = ("env", "carry", "episode", "discounted_return")  # fields of TrainState that are [B, ...]
+PLACES = (
+    "number",
+    "env",
+    "carry",
+    "episode",
+    "discounted_return",
+)  # fields of TrainState that are [B, ...]
 SAME = PartitionSpec()  # a copy on every device
 SPLIT = PartitionSpec(AXIS)
 
@@ -146,12 +153,21 @@ def fetch(layout: Layout, state: Spread) -> TrainState:
 
 
 def collect(
-    config: Config, env: Env, network: Network, learned: TrainState, places: dict, first: Array
-) -> tuple[dict[str, PyTree], algorithm.Experience]:
-    """Moves one shard on; returns its places and, stacked [1, ...], what it saw."""
-    state, experience = algorithm.collect(config, env, network, learned.replace(**places), first)
-    places = {name: getattr(state, name) for name in PLACES}
-    return places, jax.tree.map(lambda x: x[None], experience)
+    config: Config, env: Env, network: Network, learned: TrainState, places: dict[str, PyTree]
+) -> tuple[dict[str, PyTree], Experience]:
+    """Moves one shard on; returns its places and, as one part [1, ...], what it saw."""
+    state, experience = algorithm.collect(config, env, network, learned.replace(**places))
+    return {name: getattr(state, name) for name in PLACES}, experience
+
+
+def improve(
+    config: Config, network: Network, shards: Shards, state: TrainState, experience: Experience
+) -> tuple[TrainState, Metrics]:
+    """Learns from all shards, which on a GPU are cut into slices; as `algorithm.improve`."""
+    recurrent, size = is_recurrent(experience.memory), config.num_envs // shards.number
+    number = count_slices(config, size, recurrent, jax.default_backend())
+    parts = parts_of(shards, number)
+    return algorithm.improve(config, network, state, cut_in_slices(number, experience), parts)
 
 
 def update(
@@ -161,21 +177,18 @@ def update(
     told_by: ThreadPoolExecutor,
     state: Spread,
 ) -> tuple[Spread, Metrics]:
-    """One update. Each device is told what to do by a thread of its own.
+    """Makes one update. A thread of its own tells each device what to do.
 
-    A GPU's program with a loop that the host steers returns only when it is done: told one after
-    another, devices would work one after another (measured: four H200s as fast as one).
+    On a GPU, a program with a loop that the host steers returns only when it is done. So devices
+    that are told one after another work one after another (measured: four H200s as fast as one).
     """
     local = layout.shards.local
     # Taken apart in this thread: several at a time now and then found an array without its parts.
     learned = [on(device, state.learned) for device, _ in layout.here]
 
     def act(i: int) -> tuple[list[dict[str, PyTree]], PyTree]:
-        numbers, mine = layout.here[i][1], state.places[i * local : (i + 1) * local]
-        pairs = [
-            collects[i](learned[i], places, np.int32(number * layout.size))
-            for number, places in zip(numbers, mine, strict=True)
-        ]
+        mine = state.places[i * local : (i + 1) * local]
+        pairs = [collects[i](learned[i], places) for places in mine]
         return [places for places, _ in pairs], join([seen for _, seen in pairs])
 
     places, experience = zip(*told_by.map(act, range(len(collects))), strict=True)
@@ -183,96 +196,93 @@ def update(
     return Spread(improved, tuple(itertools.chain(*places))), metrics
 
 
-def compile_programs(
+def compile_update(
+    layout: Layout,
     config: Config,
     env: Env,
     network: Network,
-    evaluation: Evaluation,
-    fresh: bool,
-    shards: Shards,
-) -> Programs:
-    """Compiles what a run on several shards calls, as `compilation` does for one device."""
-    layout = make_layout(shards, config.num_envs)
-    init = functools.partial(algorithm.init, config, env, network)
-    key = jax.random.key(0)
-    abstract = jax.eval_shape(init, key)
-    learned = abstract.replace(**dict.fromkeys(PLACES))
-    seconds: dict[str, float] = {}
+    abstract: TrainState,
+    seconds: dict[str, float],
+) -> Compiling:
+    """Compiles what an update of several shards calls.
 
+    Args:
+      layout: which device computes which shards.
+      config: the hyperparameters.
+      env: the environment.
+      network: the network.
+      abstract: shapes of the whole state.
+      seconds: "update" is noted in it.
+    """
     begin = time.perf_counter()
+    shards, mesh = layout.shards, layout.mesh
+    learned = abstract.replace(**dict.fromkeys(PLACES))
     collects, experience, sums = compile_collects(layout, config, env, network, abstract)
-    improve = jax.jit(
+    improving = jax.jit(
         jax.shard_map(
-            functools.partial(algorithm.improve, config, network, shards=shards),
-            mesh=layout.mesh, in_specs=(SAME, SPLIT), out_specs=SAME, check_vma=False,
+            functools.partial(improve, config, network, shards),
+            mesh=mesh, in_specs=(SAME, SPLIT), out_specs=SAME, check_vma=False,
         ),
         compiler_options=xla_flags.equal_passes(),
     )  # fmt: skip
     whole = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct((shards.number, *x.shape[1:]), x.dtype), experience
     )
-    mesh = layout.mesh
-    traced = improve.trace(
+    traced = improving.trace(
         shapes(learned, NamedSharding(mesh, SAME)), shapes(whole, NamedSharding(mesh, SPLIT))
     )
-    improving = start("update", traced, seconds)
-    device = layout.here[0][0]
-    judge: Any = jax.jit(
-        functools.partial(judge_policy, config, env, network, evaluation.num_episodes, abstract)
-    )
-    here = shapes(learned, SingleDeviceSharding(device))
-    make = jit("init", init)
-    making = start("init", make.trace(key), seconds) if fresh else None
-    if evaluation.number:
-        judge = when_needed("evaluation", judge, here, seconds)
-    improve = improving.result()
-    seconds["update"] = time.perf_counter() - begin
-    return Programs(
-        init=making.result() if making else make,
-        update=functools.partial(
-            update, layout, collects, improve, ThreadPoolExecutor(len(collects))
-        ),
-        evaluate=lambda state: judge(on(device, state.learned)),
-        seconds=dict(seconds),  # the evaluation's may come later
-        unordered=sorted({*sums, *unordered(traced)}),
-        spread=functools.partial(spread, layout),
-        fetch=functools.partial(fetch, layout),
-    )
+    started = start("update", traced, seconds)
+
+    def finish() -> Callable[[Spread], tuple[Spread, Metrics]]:
+        compiled = started.result()
+        seconds["update"] = time.perf_counter() - begin
+        workers = ThreadPoolExecutor(len(collects))
+        return functools.partial(update, layout, collects, compiled, workers)
+
+    return Compiling(finish, sorted({*sums, *unordered(traced)}))
 
 
 def compile_collects(
     layout: Layout, config: Config, env: Env, network: Network, abstract: TrainState
 ) -> tuple[list[Callable], PyTree, list[str]]:
-    """Compiles `collect` for each device here; returns what it collects too, and unordered sums."""
+    """Compiles `collect` for each device here.
+
+    Returns:
+      The programs; the shapes of what one collects; its sums without a fixed order.
+    """
     program = jax.jit(functools.partial(collect, config, env, network), donate_argnums=1)
     learned = abstract.replace(**dict.fromkeys(PLACES))
     places = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct((layout.size, *x.shape[1:]), x.dtype),
         {name: getattr(abstract, name) for name in PLACES},
     )
-    first = jax.ShapeDtypeStruct((), jnp.int32)
 
     def build(device: Any) -> Any:
         here = SingleDeviceSharding(device)
-        return program.lower(*shapes((learned, places, first), here)).compile()
+        return program.lower(*shapes((learned, places), here)).compile()
 
     (device, _), *others = layout.here
     # The first alone: where the persistent cache serves all devices, the others find it there.
     compiled = [build(device)]
     with ThreadPoolExecutor() as pool:
         compiled += pool.map(build, [device for device, _ in others])
-    traced = program.trace(learned, places, first)
+    traced = program.trace(learned, places)
     return compiled, traced.out_info[1], unordered(traced)
 
 
-def judge_policy(
-    config: Config,
-    env: Env,
-    network: Network,
-    num_episodes: int,
-    abstract: TrainState,
-    learned: TrainState,
-) -> Metrics:
-    """Evaluates on one device, whatever their number."""
-    carry = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), abstract.carry)
-    return evaluate_in_run(config, env, network, num_episodes, learned.replace(carry=carry))
+def one_copy(layout: Layout, carry: PyTree, state: Spread) -> TrainState:
+    """Returns what an evaluation needs of a state, on one device.
+
+    Args:
+      layout: which device computes which shards.
+      carry: shapes of the policy's memory, which stands among what is spread.
+      state: the state on its devices.
+    """
+    zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), carry)
+    return on(layout.here[0][0], state.learned).replace(carry=zeros)
+
+
+def shapes_to_judge(layout: Layout, abstract: TrainState) -> TrainState:
+    """Returns the shapes of `one_copy` of a state, on its device."""
+    needed = abstract.replace(**dict.fromkeys(PLACES) | {"carry": abstract.carry})
+    return shapes(needed, SingleDeviceSharding(layout.here[0][0]))

@@ -1,14 +1,15 @@
 """The batch cut into V shards, so that bits do not depend on how many devices D share them.
 
-A shard is always computed by a program of the same width: a wider one adds in another order. A
-device that has v = V / D shards computes them one after another. What crosses shards is gathered,
-which moves numbers and adds none, and then added in the order of the shards on every device.
+A shard is always computed by a program of the same width, because a wider one adds in another
+order. A device with v = V / D shards computes them one after another. What the shards have is
+gathered, which moves numbers and adds none. Then every device adds it up in the order of shards.
 
-With one shard, the whole batch, every function here is the plain call of its argument. With
-several, arrays of a device's shards are stacked, [v, ...], and the code runs inside
-`jax.shard_map` over a mesh with the axis `AXIS` if there are several devices.
+`parts_of` makes of this the record `Parts`, through which the algorithm calls it. Arrays of a
+device's shards are stacked, [v, ...]. The code runs inside `jax.shard_map` over a mesh with the
+axis `AXIS` if there are several devices.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -17,10 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
+from purerl.core.parts import WHOLE, Parts, add_in_order
 from purerl.core.records import Array, PyTree
+from purerl.devices.slices import SIDE_BY_SIDE
 from purerl.exact import pallas_calls
 from purerl.exact.traced_loops import has_loop
-from purerl.ppo.config import check_divides
 
 AXIS = "devices"
 
@@ -37,28 +39,36 @@ class Shards(NamedTuple):
         return self.number // self.devices
 
 
-WHOLE = Shards()
+def parts_of(shards: Shards, slices: int = 1) -> Parts:
+    """Returns how the algorithm computes its parts.
 
-
-def check_sizes(shards: Shards, num_envs: int) -> None:
-    """Raises ValueError unless the devices divide the shards, and the shards the environments."""
-    if shards.number % shards.devices:
-        below = shards.number - shards.number % shards.devices
-        sizes = [str(size) for size in (1, below, below + shards.devices) if size]
-        raise ValueError(
-            f"num_shards = {shards.number} cannot be shared by {shards.devices} devices; "
-            f"num_shards could be {', '.join(dict.fromkeys(sizes))} (1: a single device is used), "
-            "or show fewer devices."
-        )
-    check_divides("num_envs", num_envs, "num_shards", shards.number)
-
-
-def each(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
-    """Returns `function` of each shard of this device, one after another, stacked [v, ...]."""
+    Args:
+      shards: how the batch is cut into shards.
+      slices: parts of each shard, computed side by side (`slices.py`); all arrays of parts are
+        [v * slices, ...].
+    """
+    inner = SIDE_BY_SIDE if slices > 1 else WHOLE
     if shards.number == 1:
-        return function(*parts)
-    # A device that has one shard computes it as one that has several, alone and not in a loop: what
-    # it reads and what it makes is set apart, the arrays that `function` closes over as well.
+        return inner
+
+    def cut(trees: PyTree) -> PyTree:
+        return jax.tree.map(lambda x: x.reshape(-1, slices, *x.shape[1:]), trees)
+
+    def map_parts(function: Callable, *trees: PyTree) -> PyTree:
+        found = each(functools.partial(inner.map, function), *cut(trees))
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
+
+    def sum_parts(function: Callable, *trees: PyTree) -> PyTree:
+        found = each(functools.partial(inner.sum, function), *cut(trees))
+        return jax.tree.map(add_in_order, gather(shards, found))
+
+    return Parts(map=map_parts, sum=sum_parts, gather=functools.partial(gather, shards))
+
+
+def each(function: Callable, *parts: PyTree) -> PyTree:
+    """Returns `function` of each shard of this device, one after another, stacked [v, ...]."""
+    # A device with one shard must compute it as a device with several does. So everything that
+    # `function` reads and makes is set apart, also the arrays that it closes over.
     first = jax.tree.map(lambda x: x[0], parts)
     closed, shapes = jax.make_jaxpr(function, return_shape=True)(*first)
     loops = has_loop(closed)
@@ -72,11 +82,11 @@ def each(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
 
 
 def in_branch(compute: Callable, *leaves: Array) -> list[Array]:
-    """Calls `compute` in a branch, of which XLA does not know that it is the one always taken.
+    """Calls `compute` in a branch that is always taken; XLA does not know that it is.
 
-    So it is compiled by itself: a loop over time (long segments' advantages, recurrent networks)
-    had other bits on a GPU in one program with what follows, though set apart. There the host waits
-    for the condition: two H200s trained 1.85 times as fast as one, not 1.90, with one a step.
+    So XLA compiles it by itself. A loop over time (advantages of long segments, recurrent networks)
+    had other bits on a GPU when it was one program with the code after it, though set apart. A
+    branch makes the host wait: two H200s trained 1.85 instead of 1.90 times as fast as one.
     """
     some = next(leaf for leaf in leaves if leaf.size)
     never = some.ravel()[0].astype(jnp.float32) < -jnp.inf
@@ -89,10 +99,11 @@ def in_branch(compute: Callable, *leaves: Array) -> list[Array]:
 
 
 def set_apart(tree: PyTree) -> PyTree:
-    """Returns arrays as they are, by a way on which XLA neither fuses nor simplifies anything.
+    """Returns arrays unchanged, and keeps XLA from fusing the code before and after them.
 
-    What it fuses with a sum decides in which order it adds, and it drops barriers before it fuses.
-    Each is a row meanwhile, since XLA chooses a table's layout for those who make and who read it.
+    The order of a sum depends on the code that XLA fuses with it, and XLA drops its own barriers
+    before it fuses. Each array travels as a row: of a table, XLA would choose the layout by the
+    code around it.
     """
     leaves, structure = jax.tree.flatten(tree)
     rows = [jnp.ravel(leaf) for leaf in leaves if leaf.size]
@@ -102,7 +113,7 @@ def set_apart(tree: PyTree) -> PyTree:
 
 
 def through_loop(rows: list[Array]) -> list[Array]:
-    """Passes arrays through a loop. XLA keeps one of two rounds; here they undo each other."""
+    """Passes arrays through a loop of two rounds, of which the second undoes the first."""
 
     def flip(x: Array) -> Array:
         return -x if jnp.issubdtype(x.dtype, jnp.floating) else ~x
@@ -110,53 +121,22 @@ def through_loop(rows: list[Array]) -> list[Array]:
     return jax.lax.fori_loop(0, 2, lambda _, rows: [flip(row) for row in rows], rows)
 
 
-def move(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
-    """Like `each`, at once: only for functions that move numbers or count, exact at any width."""
-    return function(*parts) if shards.number == 1 else jax.vmap(function)(*parts)
-
-
-def total(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
-    """Returns the sum over all V shards of `function` of each, the same on every device."""
-    return jax.tree.map(add_in_order, from_all(shards, function, *parts))
-
-
-def from_all(shards: Shards, function: Callable, *parts: PyTree) -> PyTree:
-    """Returns `function` of each of all V shards, stacked [V, ...], the same on every device."""
-    if shards.number == 1:
-        return jax.tree.map(lambda x: x[None], function(*parts))
-    return gather(shards, each(shards, function, *parts))
-
-
 def gather(shards: Shards, parts: PyTree) -> PyTree:
-    """Returns what all shards have [V, ...], from this device's [v, ...], a message a dtype.
+    """Returns what all devices have, [D * p, ...], from this one's [p, ...]: a message a dtype.
 
-    A row, as it is sent, is set apart on one device too: XLA computed a gradient's norm from slices
-    of a row by other kernels than from arrays, and in 800 steps one differed.
+    The row that is sent is set apart on one device too. Else XLA computed a gradient's norm from
+    pieces of the row by other kernels than from arrays: one of 800 steps differed.
     """
     leaves, structure = jax.tree.flatten(parts)
     gathered: list[Array] = [jnp.empty(0)] * len(leaves)
     for dtype in dict.fromkeys(leaf.dtype for leaf in leaves):
         places = [i for i, leaf in enumerate(leaves) if leaf.dtype == dtype]
-        rows = [leaves[i].reshape(shards.local, -1) for i in places]
+        rows = [leaves[i].reshape(len(leaves[i]), -1) for i in places]
         everyone = jnp.concatenate(rows, axis=1)
         if shards.devices > 1:
             everyone = jax.lax.all_gather(everyone, AXIS, tiled=True)
         ends = np.cumsum([row.shape[1] for row in rows])
         columns = jnp.split(set_apart(everyone), ends[:-1], axis=1)
         for i, column in zip(places, columns, strict=True):
-            gathered[i] = column.reshape(shards.number, *leaves[i].shape[1:])
+            gathered[i] = column.reshape(-1, *leaves[i].shape[1:])
     return jax.tree.unflatten(structure, gathered)
-
-
-def add_in_order(x: Array) -> Array:
-    """Returns the sum over the first axis, [V, ...] -> [...], by halves: one fixed tree."""
-    while x.shape[0] > 1:
-        half = x.shape[0] // 2
-        x = jnp.concatenate([x[:half] + x[half : 2 * half], x[2 * half :]])
-    return x[0]
-
-
-def numbers(shards: Shards) -> Array:
-    """Returns the numbers of this device's shards among all, [v] int32."""
-    first = jax.lax.axis_index(AXIS) * shards.local if shards.devices > 1 else 0
-    return jnp.arange(shards.local) + first

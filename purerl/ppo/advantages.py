@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from purerl.core.records import Array
 
-SHORT = 16  # steps; a GPU is sent each round of a loop by itself, 7 microseconds a step
+SHORT = 16  # steps; so short a loop is written out, since its rounds cost more than they compute
 
 
 def temporal_difference(

@@ -1,11 +1,9 @@
 """Proximal policy optimisation (Schulman et al. 2017, arXiv:1707.06347).
 
-One update, in the order you would explain it: `collect` (`rollout.py`, `targets.py`), then
-`improve` (`learner.py`, then the statistics). `init` and `update` are pure; jit each as a whole,
-once.
-
-`update` is one device's. Several devices call `collect` for each shard of the environments, and
-`improve` together (`shards.py`, `spread.py`).
+An update, in the order in which you would explain it: `collect` acts and estimates advantages
+(`rollout.py`, `batches.py`); `improve` learns (`learner.py`), then updates the statistics of
+observations and returns (`running_moments.py`). `init` and `update` are pure. Jit each as a whole,
+once: their bits depend on it.
 """
 
 from typing import NamedTuple
@@ -15,51 +13,25 @@ import jax.numpy as jnp
 
 from purerl.core.env import Env
 from purerl.core.keys import Purpose, derive, per_environment
-from purerl.core.records import (
-    Array,
-    Counter,
-    Metrics,
-    Network,
-    PyTree,
-    TrainState,
-    add_count,
-    zero_count,
-)
-from purerl.devices.shards import WHOLE, Shards, gather, total
+from purerl.core.parts import WHOLE, Parts, add_in_order, as_one_part
+from purerl.core.records import Array, Metrics, Network, PyTree, TrainState, add_count, zero_count
 from purerl.ppo import running_moments
 from purerl.ppo.batches import Batch, make_batch
-from purerl.ppo.config import Config, check_divides
-from purerl.ppo.learner import is_recurrent, learn, optimizer
-from purerl.ppo.reset_pool import count_replays
-from purerl.ppo.rollout import Finished, Transition, rollout, start_episodes
+from purerl.ppo.config import Config
+from purerl.ppo.learner import learn, optimizer
+from purerl.ppo.rollout import Transition, rollout, start_episodes
+from purerl.ppo.running_moments import Moments
 
 
 class Experience(NamedTuple):
-    """What an update learns from; one shard's, or a device's shards, stacked [v, ...]."""
+    """What an update learns from; the axis of V parts is always there."""
 
-    batch: Batch  # [T, B]
-    memory: PyTree  # [B, H] the policy's at the start of the rollout
-    observations: running_moments.Moments
-    returns: running_moments.Moments  # of the discounted return
-    sums: Metrics  # name -> []
-
-
-def check_sizes(config: Config, carry: PyTree, number: int = 1) -> None:
-    """Raises ValueError unless the minibatches divide the rollout of each of `number` shards."""
-    size, name = config.num_envs // number, "num_envs / num_shards" if number > 1 else "num_envs"
-    if config.segment_length and is_recurrent(carry):
-        raise ValueError(
-            f"segment_length is {config.segment_length}, and the network is recurrent, so that its "
-            "minibatches hold whole rollouts; segment_length must be 0."
-        )
-    because = ""
-    if is_recurrent(carry):
-        because = " The minibatches of a recurrent network hold whole rollouts."
-    else:
-        size, name = size * config.rollout_length, f"{name} * rollout_length"
-    if config.segment_length:
-        size, name = size // config.segment_length, f"{name} / segment_length"
-    check_divides(name, size, "num_minibatches", config.num_minibatches, because)
+    batch: Batch  # [V, T, B, ...]
+    memory: PyTree  # [V, B, H] the policy's at the start of the rollout
+    number: Array  # [V, B] the environments' numbers
+    observations: Moments  # [V, ...]
+    returns: Moments  # [V] of the discounted return
+    sums: Metrics  # name -> [V]
 
 
 def init(config: Config, env: Env, network: Network, key: Array) -> TrainState:
@@ -69,11 +41,9 @@ def init(config: Config, env: Env, network: Network, key: Array) -> TrainState:
     not stay in phase: B environments all at the same moment of an episode are one sample.
     """
     params, carry = network.init(derive(key, Purpose.PARAMETERS))
-    check_parameters(params)
-    check_sizes(config, carry)
-    size = config.num_envs
-    env_state = jax.vmap(env.reset)(per_environment(derive(key, Purpose.FIRST_RESET), size))
-    limit_keys = per_environment(derive(key, Purpose.FIRST_LIMIT), size)
+    size, number = config.num_envs, jnp.arange(config.num_envs, dtype=jnp.int32)
+    env_state = jax.vmap(env.reset)(per_environment(derive(key, Purpose.FIRST_RESET), number))
+    limit_keys = per_environment(derive(key, Purpose.FIRST_LIMIT), number)
     limit = jax.vmap(lambda k: jax.random.randint(k, (), 1, config.episode_length + 1))(limit_keys)
     return TrainState(
         params=params,
@@ -81,6 +51,7 @@ def init(config: Config, env: Env, network: Network, key: Array) -> TrainState:
         learning_rate=jnp.asarray(config.learning_rate, jnp.float32),
         normalizer=running_moments.init(jax.tree.map(lambda x: x[0], env_state.observation)),
         reward_normalizer=running_moments.init(jnp.zeros(())),
+        number=number,
         env=env_state,
         carry=jax.tree.map(lambda x: jnp.broadcast_to(x, (size, *x.shape)), carry),
         episode=start_episodes(env_state, limit.astype(jnp.int32)),
@@ -92,55 +63,41 @@ def init(config: Config, env: Env, network: Network, key: Array) -> TrainState:
     )
 
 
-def check_parameters(params: PyTree) -> None:
-    """Raises ValueError for a parameter that no gradient can change."""
-    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
-        if not jnp.issubdtype(leaf.dtype, jnp.floating):
-            raise ValueError(
-                f"The network's parameter {jax.tree_util.keystr(path)} is {leaf.dtype}: parameters "
-                "are trained, so they are floating-point numbers. Keep constants in the closure of "
-                "`apply`."
-            )
-
-
 def update(
     config: Config, env: Env, network: Network, state: TrainState
 ) -> tuple[TrainState, Metrics]:
-    """One rollout of T steps in B environments, then E epochs of K minibatches.
+    """Makes one rollout of T steps in B environments, then E epochs of K minibatches.
 
-    Returns the next state and metrics, name -> [] float32. Observation and return statistics
-    stay as they are until the end, so that the first policy ratio is exactly 1.
+    Returns:
+      The next state, and metrics, name -> [] float32. Observation and return statistics stay as
+      they are until the end, so that the first policy ratio is exactly 1.
     """
     state, experience = collect(config, env, network, state)
     return improve(config, network, state, experience)
 
 
 def collect(
-    config: Config, env: Env, network: Network, state: TrainState, first: Array | int = 0
+    config: Config, env: Env, network: Network, state: TrainState
 ) -> tuple[TrainState, Experience]:
-    """Acts for T steps in the environments of `state`, all or one shard's.
+    """Acts for T steps in the environments of `state`, all of them or those of one part.
 
-    Args:
-      config: the hyperparameters.
-      env: the environment.
-      network: the network.
-      state: with as many environments as are to act; they are moved on.
-      first: number of the first of them among all.
+    Returns:
+      `state` with its environments moved on, and what was seen, as one part [1, ...].
     """
     memory, opening = state.carry, state.episode.length == 0
-    state, transitions, finished, last_value = rollout(config, env, network, state, first)
+    state, transitions, sums, last_value = rollout(config, env, network, state)
+    valid, seen = transitions.valid, transitions.observation
     experience = Experience(
         batch=make_batch(config, state, transitions, last_value, opening),
         memory=memory,
-        observations=running_moments.moments(
-            state.normalizer, transitions.observation, transitions.valid
+        number=state.number,
+        observations=running_moments.deviations(state.normalizer, seen, valid),
+        returns=running_moments.deviations(
+            state.reward_normalizer, transitions.discounted_return, valid
         ),
-        returns=running_moments.moments(
-            state.reward_normalizer, transitions.discounted_return, transitions.valid
-        ),
-        sums=rollout_sums(config, transitions, finished),
+        sums=rollout_sums(transitions, sums),
     )
-    return state, experience
+    return state, as_one_part(experience)
 
 
 def improve(
@@ -148,40 +105,28 @@ def improve(
     network: Network,
     state: TrainState,
     experience: Experience,
-    shards: Shards = WHOLE,
+    parts: Parts = WHOLE,
 ) -> tuple[TrainState, Metrics]:
-    """Learns from what all shards have collected; reads nothing of the environments in `state`."""
-    batch, memory, observations, returns, sums = experience
-    state, learning = learn(config, network, state, batch, memory, shards)
-    if shards.number > 1:
-        observations, returns = map(running_moments.pool, gather(shards, (observations, returns)))
+    """Learns from what all parts have collected; does not read the environments in `state`."""
+    batch, memory, number, *rest = experience
+    state, learning = learn(config, network, state, batch, memory, number[:, 0], parts)
+    observations, returns, sums = parts.gather(rest)
+    pool, merge = running_moments.pool, running_moments.merge
     state = state.replace(
-        normalizer=running_moments.merge(state.normalizer, observations),
-        reward_normalizer=running_moments.merge(state.reward_normalizer, returns),
+        normalizer=merge(state.normalizer, pool(observations)),
+        reward_normalizer=merge(state.reward_normalizer, pool(returns)),
         update=state.update + 1,
-        steps=count_steps(config, state.steps),
+        steps=add_count(state.steps, jnp.asarray(config.steps_per_update, jnp.uint32)),
     )
-    return state, learning | rollout_metrics(total(shards, lambda x: x, sums))
+    return state, learning | rollout_metrics(jax.tree.map(add_in_order, sums))
 
 
-def count_steps(config: Config, steps: Counter) -> Counter:
-    """Adds one update's control steps."""
-    return add_count(steps, jnp.asarray(config.steps_per_update, jnp.uint32))
-
-
-def rollout_sums(config: Config, transitions: Transition, finished: Finished) -> Metrics:
-    """Adds up what `rollout_metrics` needs over a rollout's steps and environments."""
-    valid = transitions.valid.astype(jnp.float32)
-    return {
-        "reward": (valid * transitions.reward).sum(),
-        "valid": valid.sum(),
-        "episodes": finished.episodes.sum(),
-        "episode_return": finished.episode_return.sum(),
-        "episode_length": finished.length.sum(),
-        "nonfinite_resets": finished.nonfinite_resets.sum().astype(jnp.float32),
-        "replayed_resets": count_replays(config, finished.resets).astype(jnp.float32),
-        **{f"episode/{name}": x.sum() for name, x in finished.metrics.items()},
-    }
+def rollout_sums(transitions: Transition, sums: Metrics) -> Metrics:
+    """Returns sums over steps and environments, name -> []; from `sums` of each environment [B]."""
+    valid, resets = transitions.valid.astype(jnp.float32), sums.pop("resets")
+    replayed = jnp.maximum(resets - 1, 0).astype(jnp.float32)  # an update has one fresh start each
+    sums |= {"valid": valid, "reward": valid * transitions.reward, "replayed_resets": replayed}
+    return {name: x.sum() for name, x in sums.items()}
 
 
 def rollout_metrics(sums: Metrics) -> Metrics:

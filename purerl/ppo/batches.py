@@ -1,4 +1,4 @@
-"""What the losses read: advantages and value targets, of a rollout or of segments of it."""
+"""What the losses read: a rollout, or segments of it, with advantages and value targets."""
 
 from typing import NamedTuple
 
@@ -90,9 +90,9 @@ def make_batch(
     if not config.segment_length:
         return batch
     last = running_moments.normalize(state.normalizer, state.env.observation)
-    ends = slice(config.segment_length, None, config.segment_length)
+    every = config.segment_length
     following = jax.tree.map(
-        lambda x, end: jnp.concatenate([x[ends], end[None]]), batch.observation, last
+        lambda x, end: jnp.concatenate([x[every::every], end[None]]), batch.observation, last
     )
     return batch._replace(course=course, following=following)
 

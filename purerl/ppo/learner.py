@@ -1,7 +1,6 @@
 """The learner: E epochs of K minibatch steps on what an update has collected.
 
-Clipped surrogate and value loss of Schulman et al. 2017 (arXiv:1707.06347), Adam, and a learning
-rate that is constant, linear or steered by the policy's KL.
+Clipped surrogate and value loss of Schulman et al. 2017 (arXiv:1707.06347).
 """
 
 import functools
@@ -12,14 +11,14 @@ import jax.numpy as jnp
 import optax
 
 from purerl.core.keys import Purpose, derive
+from purerl.core.parts import Parts
 from purerl.core.records import Array, Metrics, Network, PolicyOutput, PyTree, TrainState
-from purerl.devices.shards import WHOLE, Shards, each, move, numbers, total
-from purerl.devices.slices import count_slices, cut_in_slices, of_slices, sum_of_slices
-from purerl.ppo import losses
+from purerl.ppo import distributions, losses
 from purerl.ppo.batches import Batch, in_one_row, in_segments, renew
 from purerl.ppo.config import Config
-from purerl.ppo.losses import Scale
+from purerl.ppo.optimizer import next_rate, optimizer, scheduled_rate
 from purerl.ppo.rollout import select
+from purerl.ppo.running_moments import Moments, moments, pool
 
 
 class Learner(NamedTuple):
@@ -29,14 +28,6 @@ class Learner(NamedTuple):
     optimizer: PyTree  # Adam's moments of all parameters
     learning_rate: Array  # []
     skipped_in_a_row: Array  # [] int32
-
-
-def optimizer(config: Config) -> optax.GradientTransformation:
-    """Clips by global norm, then Adam's direction; the caller multiplies by the learning rate."""
-    return optax.chain(
-        optax.clip_by_global_norm(config.max_gradient_norm),
-        optax.scale_by_adam(eps=1e-5),
-    )
 
 
 def is_recurrent(carry: PyTree) -> bool:
@@ -50,89 +41,98 @@ def learn(
     state: TrainState,
     batch: Batch,
     memory: PyTree,
-    shards: Shards = WHOLE,
+    first: Array,
+    parts: Parts,
 ) -> tuple[TrainState, Metrics]:
-    """E epochs of K minibatches; `memory` [B, H] is the policy's at the start of the rollout.
+    """Makes E epochs of K minibatch steps.
 
-    Each shard shuffles its own samples, and has an equal part in every minibatch.
+    Each part shuffles its own samples, and has an equal share of every minibatch.
+
+    Args:
+      config: the hyperparameters.
+      network: the network.
+      state: its environments are not read.
+      batch: [V, T, B, ...].
+      memory: [V, B, H], the policy's at the start of the rollout.
+      first: [V] number of each part's first environment, by which it shuffles.
+      parts: how the V parts are computed.
     """
-    if config.segment_length:
-        batch = move(shards, functools.partial(in_segments, config.segment_length), batch)
-    elif not is_recurrent(memory):
-        # One long row of samples: a minibatch is any of them, [1, M].
-        batch = move(shards, in_one_row, batch)
+    batch = jax.vmap(functools.partial(arrange, config, is_recurrent(memory)))(batch)
     columns = batch.weight.shape[-1]
     rate = scheduled_rate(config, state)
     learner = Learner(state.params, state.optimizer, rate, state.skipped_in_a_row)
     key = derive(state.key, Purpose.PERMUTATION, state.update)
 
-    def step(learner: Learner, part: tuple[Array, Scale | None]) -> tuple[Learner, Metrics]:
-        index, scale = part
-        minibatch, start = move(shards, _take, batch, memory, index)
-        return minibatch_step(config, network, learner, minibatch, start, scale, shards)
+    def step(learner: Learner, chosen: tuple[Array, Moments | None]) -> tuple[Learner, Metrics]:
+        index, scale = chosen
+        minibatch, start = jax.vmap(take_columns)(batch, memory, index)
+        return minibatch_step(config, network, learner, minibatch, start, scale, parts)
 
     def epoch(learner: Learner, number: Array) -> tuple[Learner, Metrics]:
-        order = shuffle(jax.random.fold_in(key, number), columns, config.num_minibatches, shards)
-        scales = None if config.segment_length else scales_of_all(batch, order, shards)
-        return jax.lax.scan(step, learner, (order, scales))
+        epoch_key = jax.random.fold_in(key, number)
+        order = shuffle(epoch_key, first, columns, config.num_minibatches)
+        scales = None if config.segment_length else advantage_scales(batch, order, parts)
+        return jax.lax.scan(step, learner, (jnp.swapaxes(order, 0, 1), scales))
 
     learner, metrics = jax.lax.scan(epoch, learner, jnp.arange(config.num_epochs))
-    state = state.replace(**learner._asdict())
-    skipped = metrics.pop("skipped")
-    # A skipped minibatch's figures are not finite; they must not hide the others'.
-    metrics = {
-        k: losses.weighted_mean(jnp.where(skipped > 0, 0.0, v), 1.0 - skipped)
-        for k, v in metrics.items()
-    }
+    metrics = average_sound(metrics)
     metrics |= {
-        "skipped_minibatches": skipped.sum(),
         "skipped_in_a_row": learner.skipped_in_a_row.astype(jnp.float32),
         "learning_rate": learner.learning_rate,
         "parameter_norm": optax.tree.norm(learner.params),
         "explained_variance": losses.explained_variance(
-            batch.old_value, batch.target, batch.weight, shards
+            batch.old_value, batch.target, batch.weight, parts
         ),
     }
-    return state, metrics
+    return state.replace(**learner._asdict()), metrics
 
 
-def _take(batch: Batch, memory: PyTree, index: Array) -> tuple[Batch, PyTree]:
+def arrange(config: Config, recurrent: bool, batch: Batch) -> Batch:
+    """Lays one part's rollout [T, B] out in columns, of which minibatches take some.
+
+    Columns are segments, whole rollouts of a network with memory, or single samples.
+    """
+    if config.segment_length:
+        return in_segments(config.segment_length, batch)
+    return batch if recurrent else in_one_row(batch)
+
+
+def take_columns(batch: Batch, memory: PyTree, index: Array) -> tuple[Batch, PyTree]:
+    """Returns the columns `index` [M] of one part's batch [T', ...], and their memory."""
     minibatch = jax.tree.map(lambda x: jnp.take(x, index, axis=1), batch)
     return minibatch, jax.tree.map(lambda x: jnp.take(x, index, axis=0), memory)
 
 
-def scales_of_all(batch: Batch, order: Array, shards: Shards) -> Scale:
-    """Returns the advantages' scales in all minibatches of an epoch, [K]: one message for them."""
-
-    def take(x: Array, order: Array) -> Array:
-        return jnp.moveaxis(jnp.take(x, order, axis=1), 1, 0)  # [K, T', M]
-
-    if shards.number > 1:
-        order = jnp.swapaxes(order, 0, 1)
-    advantage, weight = (move(shards, take, x, order) for x in (batch.advantage, batch.weight))
-    return losses.advantage_scale(advantage, weight, shards, several=True)
-
-
-def shuffle(key: Array, columns: int, minibatches: int, shards: Shards) -> Array:
-    """Returns which of a shard's columns each minibatch takes: [K, M], or [K, v, M] of shards."""
-    if shards.number == 1:
-        return jax.random.permutation(key, columns).reshape(minibatches, -1)
+def shuffle(key: Array, first: Array, columns: int, minibatches: int) -> Array:
+    """Returns which of its columns each of V parts gives to each minibatch, [V, K, M]."""
 
     def alone(number: Array) -> Array:
         order = jax.random.permutation(jax.random.fold_in(key, number), columns)
         return order.reshape(minibatches, -1)
 
-    return jnp.swapaxes(move(shards, alone, numbers(shards)), 0, 1)
+    return jax.vmap(alone)(first)
 
 
-def scheduled_rate(config: Config, state: TrainState) -> Array:
-    """Returns the learning rate that this update starts with, []."""
-    if config.schedule == "constant":  # as set now, which a resumed run may have changed
-        return jnp.asarray(config.learning_rate, jnp.float32)
-    if config.schedule == "linear":
-        progress = state.update.astype(jnp.float32) / config.num_updates
-        return config.learning_rate * (1.0 - progress)
-    return state.learning_rate
+def advantage_scales(batch: Batch, order: Array, parts: Parts) -> Moments:
+    """Returns the moments of the advantages in all K minibatches of an epoch, [K]."""
+
+    def of_each(advantage: Array, weight: Array, order: Array) -> Moments:
+        advantage, weight = (jnp.take(x, order, axis=1) for x in (advantage, weight))
+        return jax.vmap(moments, in_axes=1)(advantage, weight > 0)  # of [T', K, M]
+
+    found = parts.map(of_each, batch.advantage, batch.weight, order)
+    return pool(parts.gather(found))
+
+
+def average_sound(metrics: Metrics) -> Metrics:
+    """Averages metrics over the minibatches, [E, K] -> [], without those that were skipped.
+
+    The figures of a skipped minibatch are not finite; they must not hide the others'.
+    """
+    skipped = metrics.pop("skipped")
+    sound = jnp.maximum((1.0 - skipped).sum(), 1.0)
+    means = {k: jnp.where(skipped > 0, 0.0, x).sum() / sound for k, x in metrics.items()}
+    return means | {"skipped_minibatches": skipped.sum()}
 
 
 def unroll(network: Network, params: PyTree, batch: Batch, memory: PyTree) -> PolicyOutput:
@@ -155,30 +155,28 @@ def loss(
     config: Config,
     network: Network,
     params: PyTree,
-    scale: Scale,
+    scale: Moments,
     batch: Batch,
     memory: PyTree,
 ) -> tuple[Array, Metrics]:
-    """Returns policy loss + value_weight * value loss - entropy_weight * entropy, [], metrics.
+    """Returns policy loss + value_weight * value loss - entropy_weight * entropy, [], and metrics.
 
-    Of one shard's part of a minibatch with the advantages' `scale`: all parts' add up to the whole.
+    Of one part of a minibatch whose advantages have the moments `scale`. Their sum over all parts
+    is the minibatch's loss.
     """
-    distribution = config.action_distribution
     output = unroll(network, params, batch, memory)
-    log_ratio = distribution.log_prob(output.distribution, batch.raw_action) - batch.log_prob
+    log_prob = distributions.log_prob(output.distribution, batch.raw_action)
+    log_ratio = log_prob - batch.log_prob
     advantage = losses.normalize_advantage(batch.advantage, scale)
-    policy = losses.clipped_surrogate(log_ratio, advantage, config.clip)
-    value = losses.value_loss(output.value, batch.old_value, batch.target, config.value_clip)
-    entropy = distribution.entropy(output.distribution)
-    clipped = (jnp.abs(jnp.expm1(log_ratio)) > config.clip).astype(jnp.float32)
     terms = {
-        "policy_loss": policy,
-        "value_loss": value,
-        "entropy": entropy,
+        "policy_loss": losses.clipped_surrogate(log_ratio, advantage, config.clip),
+        "value_loss": losses.value_loss(output.value, batch.target),
+        "entropy": distributions.entropy(output.distribution),
         "kl": losses.approximate_kl(log_ratio),
-        "clip_fraction": clipped,
+        "clip_fraction": (jnp.abs(jnp.expm1(log_ratio)) > config.clip).astype(jnp.float32),
     }
-    means = {k: (batch.weight * term).sum() / scale.weight for k, term in terms.items()}
+    number = jnp.maximum(scale.number.astype(jnp.float32), 1.0)
+    means = {k: (batch.weight * term).sum() / number for k, term in terms.items()}
     objective = (
         means["policy_loss"]
         + config.value_weight * means["value_loss"]
@@ -193,20 +191,25 @@ def minibatch_step(
     learner: Learner,
     batch: Batch,
     memory: PyTree,
-    scale: Scale | None,
-    shards: Shards,
+    scale: Moments | None,
+    parts: Parts,
 ) -> tuple[Learner, Metrics]:
-    """One gradient step, skipped and counted if any of it is not finite.
+    """Makes one gradient step; a step with a number that is not finite is skipped and counted.
 
-    Without a `scale` of the advantages, segments are estimated anew, and have their own.
+    Args:
+      config: the hyperparameters.
+      network: the network.
+      learner: what the step changes.
+      batch: the minibatch, [V, T', M, ...].
+      memory: [V, M, H].
+      scale: of its advantages; None: segments, whose advantages are estimated anew.
+      parts: how the V parts are computed.
     """
-    rows, columns = batch.weight.shape[-2:]  # of one shard
-    number = count_slices(rows, columns, jax.default_backend())
-    batch, memory = move(shards, functools.partial(cut_in_slices, number), batch, memory)
     if scale is None:
         anew = functools.partial(renew, config, network, learner.params)
-        batch = each(shards, functools.partial(of_slices, number, anew), batch, memory)
-        scale = losses.advantage_scale(batch.advantage, batch.weight, shards)
+        batch = parts.map(anew, batch, memory)
+        found = parts.map(moments, batch.advantage, batch.weight > 0)
+        scale = pool(parts.gather(found))
 
     def gradient(batch: Batch, memory: PyTree) -> tuple[tuple[Array, Metrics], PyTree]:
         def objective(params: PyTree) -> tuple[Array, Metrics]:
@@ -214,8 +217,7 @@ def minibatch_step(
 
         return jax.value_and_grad(objective, has_aux=True)(learner.params)
 
-    add = functools.partial(sum_of_slices, number, gradient)
-    (objective, metrics), gradients = total(shards, add, batch, memory)
+    (objective, metrics), gradients = parts.sum(gradient, batch, memory)
     norm = optax.tree.norm(gradients)
     sound = jnp.isfinite(objective) & jnp.isfinite(norm)
     updates, optimizer_state = optimizer(config).update(gradients, learner.optimizer)
@@ -235,18 +237,3 @@ def minibatch_step(
     )
     skipped = 1.0 - sound.astype(jnp.float32)
     return learner, metrics | {"loss": objective, "gradient_norm": norm, "skipped": skipped}
-
-
-def next_rate(config: Config, rate: Array, kl: Array, sound: Array) -> Array:
-    """Returns the learning rate after a minibatch whose policy had moved by `kl` [].
-
-    The adaptive schedule of Schulman et al. 2017 (section 4), applied to the learning rate: a
-    factor 1.5 down above twice the desired KL, up below half of it, within [1e-5, 1e-2].
-    """
-    if config.schedule != "adaptive_kl":
-        return rate
-    down = jnp.maximum(rate / 1.5, 1e-5)
-    up = jnp.minimum(rate * 1.5, 1e-2)
-    moved = jnp.where(kl < 0.5 * config.desired_kl, up, rate)
-    moved = jnp.where(kl > 2.0 * config.desired_kl, down, moved)
-    return jnp.where(sound, moved, rate)

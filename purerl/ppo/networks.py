@@ -1,10 +1,9 @@
 """Policy and value networks: the default MLP, recurrent ones, and an adapter for any Flax module.
 
-`ppo.py` knows only `Network(init, apply)`; this is the one module that imports a network library.
+The algorithm knows only `Network(init, apply)`. This module alone imports a network library.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -13,26 +12,17 @@ import jax
 import jax.numpy as jnp
 
 from purerl.core.records import Array, Network, Normal, PolicyOutput, PyTree
+from purerl.ppo.checks import check_observation
 
-ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
-    "elu": nn.elu,
-    "relu": nn.relu,
-    "swish": nn.swish,
-    "tanh": nn.tanh,
-}
 MIN_SCALE = 1e-3  # a policy of scale 0 has an infinite density
 
 
 @dataclass(frozen=True)
-class MlpOptions:
-    """Sizes of the default feed-forward network."""
+class PolicyOptions:
+    """What both networks below can choose."""
 
-    policy_hidden: tuple[int, ...] = (128, 128)
-    """Widths of the policy's hidden layers."""
-    value_hidden: tuple[int, ...] = (256, 256)
-    """Widths of the value function's hidden layers."""
     activation: Literal["elu", "relu", "swish", "tanh"] = "swish"
-    """Nonlinearity of the hidden layers."""
+    """Nonlinearity of the feed-forward layers."""
     std: Literal["learned", "state"] = "learned"
     """Policy scale: one learned vector, or a function of the observation."""
     initial_std: float = 0.6
@@ -40,11 +30,24 @@ class MlpOptions:
 
     def __post_init__(self) -> None:
         """Raises ValueError for a scale that is none."""
-        _check_std(self.initial_std)
+        if not MIN_SCALE <= self.initial_std <= 100.0:
+            raise ValueError(
+                f"initial_std is {self.initial_std}; it must be from {MIN_SCALE} to 100."
+            )
 
 
 @dataclass(frozen=True)
-class RecurrentOptions:
+class MlpOptions(PolicyOptions):
+    """Sizes of the default feed-forward network."""
+
+    policy_hidden: tuple[int, ...] = (128, 128)
+    """Widths of the policy's hidden layers."""
+    value_hidden: tuple[int, ...] = (256, 256)
+    """Widths of the value function's hidden layers."""
+
+
+@dataclass(frozen=True)
+class RecurrentOptions(PolicyOptions):
     """Sizes of the recurrent network."""
 
     cell: Literal["gru", "lstm"] = "gru"
@@ -55,70 +58,6 @@ class RecurrentOptions:
     """Widths of the layers before the cell."""
     value_hidden: tuple[int, ...] = (128,)
     """Widths of the value function's hidden layers, after the cell."""
-    activation: Literal["elu", "relu", "swish", "tanh"] = "swish"
-    """Nonlinearity of the feed-forward layers."""
-    std: Literal["learned", "state"] = "learned"
-    """Policy scale: one learned vector, or a function of the observation."""
-    initial_std: float = 0.6
-    """Policy scale before training, in raw-action units."""
-
-    def __post_init__(self) -> None:
-        """Raises ValueError for a scale that is none."""
-        _check_std(self.initial_std)
-
-
-def _check_std(initial_std: float) -> None:
-    if not MIN_SCALE <= initial_std <= 100.0:
-        raise ValueError(f"initial_std is {initial_std}; it must be from {MIN_SCALE} to 100.")
-
-
-def check_observation(observation: PyTree) -> None:
-    """Raises ValueError unless an observation is an array [O], or a flat dict of such."""
-    parts = observation if isinstance(observation, dict) else {"policy": observation}
-    if "policy" not in parts:
-        raise ValueError(
-            f"The observation is a dict of {', '.join(sorted(parts))}; the entry that the policy "
-            "may read must be called policy (the value function reads all)."
-        )
-    for name, part in parts.items():
-        if getattr(part, "ndim", None) != 1:
-            what = (
-                f"of shape {part.shape}" if hasattr(part, "shape") else f"a {type(part).__name__}"
-            )
-            raise ValueError(
-                f"The observation's part {name} is {what}; this network takes arrays [O]: flatten "
-                "it, or write a network of your own (experiments/custom_network.py)."
-            )
-
-
-def check_network(network: Network, observation: PyTree, action_size: int) -> None:
-    """Raises ValueError unless a network's answers have the shapes that the trainer reads.
-
-    Args:
-      network: the network; nothing is computed.
-      observation: an example, leaves [O].
-      action_size: A.
-    """
-    params, carry = jax.eval_shape(network.init, jax.random.key(0))
-    batch = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct((2, *x.shape), x.dtype), (observation, carry)
-    )
-    output, following = jax.eval_shape(network.apply, params, *batch)
-    scalar, action = (2,), (2, action_size)
-    normal = output.distribution
-    answers = [("loc", normal.loc, action), ("scale", normal.scale, action)]
-    for name, answer, shape in [*answers, ("value", output.value, scalar)]:
-        if answer.shape != shape:
-            raise ValueError(
-                f"The network's {name} is {list(answer.shape)} for 2 observations and "
-                f"{action_size} actions; it must be {list(shape)}."
-            )
-    kinds = [jax.tree.map(lambda x: (x.shape, x.dtype), tree) for tree in (batch[1], following)]
-    if kinds[0] != kinds[1]:
-        raise ValueError(
-            f"The network's memory goes in as {kinds[0]} and comes back as {kinds[1]}, for 2 "
-            "environments; `apply` must return it as it was given, and `init` one environment's."
-        )
 
 
 def policy_features(observation: PyTree) -> Array:
@@ -133,10 +72,6 @@ def value_features(observation: PyTree) -> Array:
     return jnp.concatenate([observation[name] for name in sorted(observation)], axis=-1)
 
 
-def _inverse_softplus(x: float) -> float:
-    return math.log(math.expm1(x))
-
-
 class Stack(nn.Module):
     """Dense layers with an activation after each."""
 
@@ -147,7 +82,7 @@ class Stack(nn.Module):
     def __call__(self, x: Array) -> Array:
         """Returns [..., last width]."""
         for width in self.widths:
-            x = ACTIVATIONS[self.activation](nn.Dense(width)(x))
+            x = getattr(nn, self.activation)(nn.Dense(width)(x))
         return x
 
 
@@ -168,8 +103,8 @@ class GaussianHead(nn.Module):
             raw = nn.Dense(self.action_size, kernel_init=small, name="scale")(x)
         else:
             raw = self.param("scale", nn.initializers.zeros, (self.action_size,))
-        offset = _inverse_softplus(self.initial_std)
-        scale = jax.nn.softplus(raw + offset) + MIN_SCALE
+        inverse_softplus = math.log(math.expm1(self.initial_std))
+        scale = jax.nn.softplus(raw + inverse_softplus) + MIN_SCALE
         return Normal(loc=loc, scale=jnp.broadcast_to(scale, loc.shape))
 
 

@@ -1,4 +1,4 @@
-"""Acting in B environments for T steps: time limit, fresh resets, action repeat, NaN containment.
+"""Acting in B environments for T steps: time limit, autoreset, NaN containment.
 
 `rollout` is the only place that knows where one episode ends and the next begins.
 """
@@ -7,25 +7,30 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 
 from purerl.core.env import ABSURD, Env, State
 from purerl.core.keys import Purpose, derive, per_environment
-from purerl.core.records import Array, EpisodeStats, Network, PolicyOutput, PyTree, TrainState
-from purerl.ppo import running_moments
+from purerl.core.records import (
+    Array,
+    EpisodeStats,
+    Metrics,
+    Network,
+    PolicyOutput,
+    PyTree,
+    TrainState,
+)
+from purerl.ppo import distributions, running_moments
 from purerl.ppo.config import Config
-from purerl.ppo.distributions import sample
-from purerl.ppo.reset_pool import draw_pool, take_from_pool
 
 
 class Transition(NamedTuple):
-    """One policy step; a rollout is [T, B, ...]."""
+    """One control step; a rollout is [T, B, ...]."""
 
     observation: PyTree  # [..., O] before the step
     raw_action: Array  # [..., A] before squashing
     log_prob: Array  # [...] of the raw action, under the policy that acted
     value: Array  # [...] V(s_t)
-    reward: Array  # [...] unscaled, summed over the action's repeats
+    reward: Array  # [...] unscaled
     discounted_return: Array  # [...] running, for reward scaling
     terminated: Array  # [...] bool
     done: Array  # [...] bool: terminated, truncated or lost; the next row is another episode
@@ -34,25 +39,14 @@ class Transition(NamedTuple):
     valid: Array  # [...] bool: False where the physics blew up
 
 
-class Finished(struct.PyTreeNode):
-    """Sums over the episodes that ended, one environment each; also what was lost."""
-
-    episodes: Array  # [B] float32 how many ended soundly
-    episode_return: Array  # [B]
-    length: Array  # [B]
-    metrics: dict[str, Array]  # name -> [B], mean over (or sum of) each episode, added up
-    resets: Array  # [B] int32 starts taken from the pool
-    nonfinite_resets: Array  # [B] int32 episodes lost to non-finite or absurd states
-
-
 class Carry(NamedTuple):
-    """What the scan over time carries."""
+    """What the scan over time carries, [B, ...]."""
 
     env: State
     memory: PyTree
     episode: EpisodeStats
     discounted_return: Array
-    finished: Finished
+    sums: Metrics  # name -> [B] over the episodes that ended, and how many "resets" there were
 
 
 def select(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
@@ -74,19 +68,17 @@ def is_lost(state: State) -> Array:
 
 
 def act(
-    network: Network,
-    params: PyTree,
-    statistics: running_moments.Statistics,
-    state: State,
-    memory: PyTree,
+    network: Network, state: TrainState, env: State, memory: PyTree
 ) -> tuple[PolicyOutput, PyTree]:
-    """Applies the network to the normalized observations of `state` [B]."""
-    return network.apply(params, running_moments.normalize(statistics, state.observation), memory)
+    """Applies the network of `state` to the normalized observations of environments [B]."""
+    observation = running_moments.normalize(state.normalizer, env.observation)
+    return network.apply(state.params, observation, memory)
 
 
-def episode_metric(name: str, total: Array, length: Array) -> Array:
-    """Returns an episode's metric from its sum: the mean per step, or the sum for `*_count`."""
-    return total if name.endswith("_count") else total / jnp.maximum(length, 1).astype(jnp.float32)
+def episode_metrics(episode: EpisodeStats) -> Metrics:
+    """Returns episodes' metrics [B]: the mean over their steps, or the sum for `*_count`."""
+    length = jnp.maximum(episode.length, 1).astype(jnp.float32)
+    return {k: x if k.endswith("_count") else x / length for k, x in episode.metrics.items()}
 
 
 def start_memory(carry: PyTree, number: int) -> PyTree:
@@ -105,10 +97,10 @@ def start_episodes(state: State, limit: Array) -> EpisodeStats:
     )
 
 
-def one_control_step(
+def step_episodes(
     env: Env, state: State, episode: EpisodeStats, action: Array
 ) -> tuple[State, EpisodeStats]:
-    """Steps environments [B] once and adds the step to their episodes; applies the time limit."""
+    """Steps environments [B] once, adds the step to their episodes, applies the time limit."""
     state = jax.vmap(env.step)(state, action)
     length = episode.length + 1
     truncated = (state.truncated | (length >= episode.limit)) & ~state.terminated
@@ -120,36 +112,8 @@ def one_control_step(
     return state.replace(truncated=truncated), episode
 
 
-def repeat_step(
-    config: Config, env: Env, state: State, episode: EpisodeStats, action: Array
-) -> tuple[State, EpisodeStats, Array]:
-    """Holds `action` [B, A] for `action_repeat` control steps; an ended episode stands still.
-
-    Returns the states, the episodes' statistics, and the reward summed over the repeats [B].
-    """
-    state, episode = one_control_step(env, state, episode, action)
-    if config.action_repeat == 1:
-        return state, episode, state.reward
-
-    def again(carry: tuple[State, EpisodeStats, Array], _: None) -> tuple[tuple, None]:
-        state, episode, reward = carry
-        over = state.terminated | state.truncated | jax.vmap(is_lost)(state)
-        following = one_control_step(env, state, episode, action)
-        state, episode = select(over, (state, episode), following)
-        return (state, episode, jnp.where(over, reward, reward + state.reward)), None
-
-    carry = (state, episode, state.reward)
-    carry, _ = jax.lax.scan(again, carry, length=config.action_repeat - 1)
-    return carry
-
-
 def truncation_values(
-    network: Network,
-    params: PyTree,
-    statistics: running_moments.Statistics,
-    state: State,
-    memory: PyTree,
-    truncated: Array,
+    network: Network, state: TrainState, env: State, memory: PyTree, truncated: Array
 ) -> Array:
     """Returns V(s'_t) where `truncated` [B], else 0.
 
@@ -158,110 +122,84 @@ def truncation_values(
     """
 
     def values() -> Array:
-        output, _ = act(network, params, statistics, state, memory)
+        output, _ = act(network, state, env, memory)
         # `where` also drops the values of environments that are lost.
         return jnp.where(truncated, output.value, 0.0)
 
     return jax.lax.cond(truncated.any(), values, lambda: jnp.zeros(truncated.shape))
 
 
-def count_finished(finished: Finished, episode: EpisodeStats, over: Array, lost: Array) -> Finished:
-    """Adds the episodes that are `over` [B] soundly, and counts the `lost` [B]."""
-    sound = over & ~lost
+def episode_sums(episode: EpisodeStats, over: Array, lost: Array) -> Metrics:
+    """Returns what each environment [B] adds to the sums of a rollout in one step.
 
-    def add(total: Array, x: Array | float) -> Array:
-        return total + jnp.where(sound, x, 0.0)
-
-    metrics = {
-        name: add(total, episode_metric(name, episode.metrics[name], episode.length))
-        for name, total in finished.metrics.items()
-    }
-    return Finished(
-        episodes=add(finished.episodes, 1.0),
-        episode_return=add(finished.episode_return, episode.episode_return),
-        length=add(finished.length, episode.length.astype(jnp.float32)),
-        metrics=metrics,
-        resets=finished.resets + over.astype(jnp.int32),
-        nonfinite_resets=finished.nonfinite_resets + lost.astype(jnp.int32),
-    )
-
-
-def nothing_finished(state: State) -> Finished:
-    """Returns empty sums for environments `state` [B]."""
-    zeros = jnp.zeros(state.reward.shape)
-    none = jnp.zeros(state.reward.shape, jnp.int32)
-    return Finished(
-        episodes=zeros,
-        episode_return=zeros,
-        length=zeros,
-        metrics={name: zeros for name in state.metrics},
-        resets=none,
-        nonfinite_resets=none,
-    )
+    Args:
+      episode: its episode.
+      over: [B] bool: the episode ends.
+      lost: [B] bool: it ends because its state is not finite, or absurd.
+    """
+    metrics = {f"episode/{name}": x for name, x in episode_metrics(episode).items()}
+    ended = {"episodes": jnp.ones(over.shape), "episode_return": episode.episode_return}
+    ended |= {"episode_length": episode.length.astype(jnp.float32)} | metrics
+    sound = {name: jnp.where(over & ~lost, x, 0.0) for name, x in ended.items()}
+    return sound | {"nonfinite_resets": lost.astype(jnp.float32), "resets": over.astype(jnp.int32)}
 
 
 def rollout(
-    config: Config, env: Env, network: Network, state: TrainState, first: Array | int = 0
-) -> tuple[TrainState, Transition, Finished, Array]:
-    """Acts for T steps in the environments of `state`, which are number `first` and following.
+    config: Config, env: Env, network: Network, state: TrainState
+) -> tuple[TrainState, Transition, Metrics, Array]:
+    """Acts for T steps in the environments of `state`.
 
-    Returns `state` with environments, memory and running episodes moved on, the transitions
-    [T, B, ...], the episodes that finished, and the value of the last observation [B].
+    Returns:
+      `state` with environments, memory and running episodes moved on; the transitions [T, B, ...];
+      sums over the episodes that ended, name -> [B]; the value of the last observation [B].
     """
-    size = state.discounted_return.shape[0]
-    pool = draw_pool(config, env, derive(state.key, Purpose.RESET, state.update), size, first)
+    reset_keys = per_environment(derive(state.key, Purpose.RESET, state.update), state.number)
+    fresh = jax.vmap(lambda key: env.reset(jax.random.fold_in(key, 0)))(reset_keys)
     action_key = derive(state.key, Purpose.ACTION, state.update)
 
     def step(carry: Carry, t: Array) -> tuple[Carry, Transition]:
-        keys = per_environment(jax.random.fold_in(action_key, t), size, first)
-        return _policy_step(config, env, network, state, pool, carry, keys)
+        keys = per_environment(jax.random.fold_in(action_key, t), state.number)
+        return _step(config, env, network, state, fresh, carry, keys)
 
-    start = Carry(
-        env=state.env,
-        memory=state.carry,
-        episode=state.episode,
-        discounted_return=state.discounted_return,
-        finished=nothing_finished(state.env),
-    )
+    never = jnp.zeros(state.number.shape, bool)
+    nothing = episode_sums(state.episode, never, never)
+    start = Carry(state.env, state.carry, state.episode, state.discounted_return, nothing)
     end, transitions = jax.lax.scan(step, start, jnp.arange(config.rollout_length))
-    output, _ = act(network, state.params, state.normalizer, end.env, end.memory)
+    output, _ = act(network, state, end.env, end.memory)
     state = state.replace(
         env=end.env,
         carry=end.memory,
         episode=end.episode,
         discounted_return=end.discounted_return,
     )
-    return state, transitions, end.finished, output.value
+    return state, transitions, end.sums, output.value
 
 
-def _policy_step(
+def _step(
     config: Config,
     env: Env,
     network: Network,
     state: TrainState,
-    pool: State,
+    fresh: State,
     carry: Carry,
     keys: Array,
 ) -> tuple[Carry, Transition]:
-    """Acts once in every environment, with noise from `keys` [B]; resets those that ended."""
-    distribution = config.action_distribution
-    output, memory = act(network, state.params, state.normalizer, carry.env, carry.memory)
+    """Acts once in every environment, with noise from `keys` [B]; `fresh` replaces what ended."""
+    output, memory = act(network, state, carry.env, carry.memory)
     noise = jax.vmap(lambda key: jax.random.normal(key, (env.action_size,)))(keys)
-    raw = sample(output.distribution, noise)
-    action = distribution.to_action(raw)
-    env_state, episode, reward = repeat_step(config, env, carry.env, carry.episode, action)
+    raw = distributions.sample(output.distribution, noise)
+    action = distributions.to_action(raw)
+    env_state, episode = step_episodes(env, carry.env, carry.episode, action)
 
     lost = jax.vmap(is_lost)(env_state)
     terminated = env_state.terminated & ~lost
     truncated = env_state.truncated & ~lost
     over = terminated | truncated | lost
-    reward = jnp.where(lost, 0.0, reward)
+    reward = jnp.where(lost, 0.0, env_state.reward)
     discounted_return = config.gamma * carry.discounted_return + reward
-    truncation_value = truncation_values(
-        network, state.params, state.normalizer, env_state, memory, truncated
-    )
     # A fresh start may itself be NaN, and 0 times NaN is no 0.
-    seen = carry.env.observation, raw, distribution.log_prob(output.distribution, raw), output.value
+    log_prob = distributions.log_prob(output.distribution, raw)
+    seen = carry.env.observation, raw, log_prob, output.value
     observation, raw, log_prob, value = select(lost, jax.tree.map(jnp.zeros_like, seen), seen)
     transition = Transition(
         observation=observation,
@@ -273,16 +211,15 @@ def _policy_step(
         terminated=terminated,
         done=over,
         truncated=truncated,
-        truncation_value=truncation_value,
+        truncation_value=truncation_values(network, state, env_state, memory, truncated),
         valid=~lost,
     )
-    fresh = take_from_pool(pool, carry.finished.resets)
     limit = jnp.full(over.shape, config.episode_length, jnp.int32)
     following = Carry(
         env=select(over, fresh, env_state),
         memory=jax.tree.map(lambda x: select(over, jnp.zeros_like(x), x), memory),
         episode=select(over, start_episodes(fresh, limit), episode),
         discounted_return=jnp.where(over, 0.0, discounted_return),
-        finished=count_finished(carry.finished, episode, over, lost),
+        sums=jax.tree.map(jnp.add, carry.sums, episode_sums(episode, over, lost)),
     )
     return following, transition

@@ -1,4 +1,4 @@
-"""Running mean and variance of a pytree of features, merged batch by batch.
+"""Mean and variance: of one batch, of the parts of a batch together, and running over batches.
 
 Merging follows Chan, Golub and LeVeque, "Updating formulae and a pairwise algorithm for computing
 sample variances" (1979), in terms of the new batch's share f = n_batch / n_total:
@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from purerl.core.parts import add_in_order
 from purerl.core.records import Array, Counter, PyTree, add_count, count_as_float, zero_count
-from purerl.devices.shards import add_in_order
 
 # A feature that never moved has variance 0; the floor keeps its first movement finite.
 VARIANCE_FLOOR = 1e-8
@@ -40,11 +40,22 @@ class Statistics(struct.PyTreeNode):
     variance: PyTree  # of Compensated, the population variance
 
 
+class Moments(NamedTuple):
+    """Mean and variance of a batch; of V parts of it [V, ...]."""
+
+    number: Array  # [] uint32 samples
+    mean: PyTree  # [O] of the difference from a reference
+    variance: PyTree  # [O] population variance
+
+
 def init(example: PyTree) -> Statistics:
     """Returns statistics of nothing (mean 0, variance 1) for features shaped like `example`."""
-    zeros = jax.tree.map(lambda x: Compensated(jnp.zeros(x.shape), jnp.zeros(x.shape)), example)
-    ones = jax.tree.map(lambda x: Compensated(jnp.ones(x.shape), jnp.zeros(x.shape)), example)
-    return Statistics(count=zero_count(), mean=zeros, variance=ones)
+
+    def full(number: float) -> PyTree:
+        fill = jnp.full_like
+        return jax.tree.map(lambda x: Compensated(fill(x, number), jnp.zeros_like(x)), example)
+
+    return Statistics(count=zero_count(), mean=full(0.0), variance=full(1.0))
 
 
 def normalize(statistics: Statistics, features: PyTree) -> PyTree:
@@ -63,69 +74,67 @@ def _like(feature: Array, x: Array) -> Array:
     return jnp.expand_dims(feature, tuple(range(x.ndim - feature.ndim)))
 
 
-class Moments(NamedTuple):
-    """What a batch adds to statistics; of V shards [V, ...]."""
-
-    number: Array  # [] uint32 samples
-    delta: PyTree  # [O] mean of the batch, less that of the statistics
-    spread: PyTree  # [O] population variance of the batch
+def deviations(statistics: Statistics, batch: PyTree, valid: Array) -> Moments:
+    """Returns the moments of `batch` where `valid`, with the running mean as the reference."""
+    reference = jax.tree.map(lambda x, mean: mean.value, batch, statistics.mean)
+    return moments(batch, valid, reference)
 
 
-def update(statistics: Statistics, batch: PyTree, valid: Array) -> Statistics:
-    """Merges `batch` (leaves [..., O]) where `valid` ([...] bool) into the statistics."""
-    return merge(statistics, moments(statistics, batch, valid))
+def moments(batch: PyTree, valid: Array, reference: PyTree = None) -> Moments:
+    """Returns the moments of a batch.
+
+    Args:
+      batch: leaves [..., O].
+      valid: [...] bool: which samples count; of none of them, mean and variance are 0.
+      reference: leaves [O] near the mean, so that a large offset does not cost precision; or 0.
+    """
+    if reference is None:
+        reference = jax.tree.map(lambda x: jnp.zeros(x.shape[valid.ndim :]), batch)
+    pairs = jax.tree.map(lambda x, near: _moments(x, valid, near), batch, reference)
+    mean = jax.tree.map(lambda _, pair: pair[0], batch, pairs)
+    variance = jax.tree.map(lambda _, pair: pair[1], batch, pairs)
+    return Moments(valid.sum(dtype=jnp.uint32), mean, variance)
 
 
-def moments(statistics: Statistics, batch: PyTree, valid: Array) -> Moments:
-    """Returns the moments of `batch` (leaves [..., O]) where `valid` ([...] bool)."""
-    pairs = jax.tree.map(lambda x, mean: _moments(x, valid, mean), batch, statistics.mean)
-    delta = jax.tree.map(lambda _, pair: pair[0], batch, pairs)
-    spread = jax.tree.map(lambda _, pair: pair[1], batch, pairs)
-    return Moments(valid.sum(dtype=jnp.uint32), delta, spread)
-
-
-def _moments(x: Array, valid: Array, mean: Compensated) -> tuple[Array, Array]:
-    """Returns mean (less the old one) and variance [O] of one leaf `x` [..., O]."""
+def _moments(x: Array, valid: Array, reference: Array) -> tuple[Array, Array]:
+    """Returns mean (less the reference) and variance [O] of one leaf `x` [..., O]."""
     axes = tuple(range(valid.ndim))
     mask = jnp.expand_dims(valid, tuple(range(valid.ndim, x.ndim)))
     number = jnp.maximum(valid.sum(dtype=jnp.float32), 1.0)
-    # Deviations from the old mean, so that a large offset does not cost precision.
-    deviation = jnp.where(mask, x - _like(mean.value, x), 0.0)
-    delta = deviation.sum(axes) / number
-    spread = jnp.where(mask, jnp.square(deviation - _like(delta, x)), 0.0).sum(axes) / number
-    return delta, spread
+    deviation = jnp.where(mask, x - _like(reference, x), 0.0)
+    mean = deviation.sum(axes) / number
+    spread = jnp.where(mask, jnp.square(deviation - _like(mean, x)), 0.0).sum(axes) / number
+    return mean, spread
 
 
 def pool(parts: Moments) -> Moments:
-    """Returns the moments of V shards together, from those of each [V, ...], in their order."""
+    """Returns the moments of V parts together, [...], from those of each, [V, ...]."""
     number = add_in_order(parts.number)
-    share = parts.number.astype(jnp.float32) / jnp.maximum(number.astype(jnp.float32), 1.0)
+    whole = jnp.maximum(number.astype(jnp.float32), 1.0)
+    share = parts.number.astype(jnp.float32) / whole[None]
 
-    def mean(x: Array) -> Array:
-        return add_in_order(jnp.expand_dims(share, tuple(range(1, x.ndim))) * x)
+    def average(x: Array) -> Array:
+        return add_in_order(jnp.expand_dims(share, tuple(range(share.ndim, x.ndim))) * x)
 
-    delta = jax.tree.map(mean, parts.delta)
-    spread = jax.tree.map(
-        lambda s, d, whole: mean(s + jnp.square(d - _like(whole, d))),
-        parts.spread,
-        parts.delta,
-        delta,
-    )
-    return Moments(number, delta, spread)
+    def spread(variance: Array, mean: Array, whole: Array) -> Array:
+        return average(variance + jnp.square(mean - whole[None]))
+
+    mean = jax.tree.map(average, parts.mean)
+    return Moments(number, mean, jax.tree.map(spread, parts.variance, parts.mean, mean))
 
 
 def merge(statistics: Statistics, batch: Moments) -> Statistics:
-    """Merges a batch into the statistics."""
+    """Merges the `deviations` of a batch into the statistics."""
     count = add_count(statistics.count, batch.number)
     share = batch.number.astype(jnp.float32) / jnp.maximum(count_as_float(count), 1.0)
-    mean = jax.tree.map(lambda delta, mean: _add(mean, share * delta), batch.delta, statistics.mean)
+    mean = jax.tree.map(lambda delta, mean: _add(mean, share * delta), batch.mean, statistics.mean)
     variance = jax.tree.map(
         lambda delta, spread, variance: _add(
             variance,
             share * (spread - variance.value) + share * (1.0 - share) * jnp.square(delta),
         ),
-        batch.delta,
-        batch.spread,
+        batch.mean,
+        batch.variance,
         statistics.variance,
     )
     return Statistics(count=count, mean=mean, variance=variance)

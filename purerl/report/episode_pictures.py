@@ -9,6 +9,7 @@ that one's PhysicsState. Two methods are optional:
   are not all in the model at once, such as the far platforms of a corridor. Only drawn.
 """
 
+import functools
 import math
 from typing import Any, NamedTuple
 
@@ -18,11 +19,12 @@ import numpy as np
 
 from purerl.core.env import Env, State
 from purerl.core.errors import UserError
-from purerl.core.keys import per_environment
-from purerl.core.records import Array, EpisodeStats, Network, PyTree, TrainState
+from purerl.core.records import Array, Network, TrainState
 from purerl.physics.interface import Physics
+from purerl.ppo import distributions
 from purerl.ppo.config import Config
-from purerl.ppo.rollout import act, is_lost, one_control_step, select, start_episodes, start_memory
+from purerl.ppo.evaluation import Progress, advance, start
+from purerl.ppo.rollout import act
 
 MAX_FRAMES_PER_SECOND = 50.0
 
@@ -45,14 +47,6 @@ class Recording(NamedTuple):
     episode_return: Array  # [N] of the part that was recorded
     length: Array  # [N] int32 control steps recorded
     over: Array  # [N] bool: whether the episode ended, or was only cut
-
-
-class Moment(NamedTuple):
-    """What the loop over control steps carries, [N, ...]."""
-
-    env: State
-    episode: EpisodeStats
-    over: Array  # [N] bool
 
 
 def physics_of(env: Env) -> Physics:
@@ -78,52 +72,28 @@ def record(
     """Plays N episodes by the deterministic policy and keeps how every state looked; pure.
 
     Args:
-      config: for the time limit, the action repeat and the distribution.
+      config: for the time limit.
       env: the environment, with `physics`.
       network: the network.
       state: for `params` and `normalizer`, and the shape of one environment's memory.
       key: [] typed; must not be one that training uses.
       num_episodes: N.
-      num_steps: control steps to record at most, rounded up to whole actions.
+      num_steps: control steps to record at most.
     """
-    start = jax.vmap(env.reset)(per_environment(key, num_episodes))
-    limit = jnp.full(num_episodes, config.episode_length, jnp.int32)
-    memory = start_memory(state.carry, num_episodes)
-    moment = Moment(start, start_episodes(start, limit), jnp.zeros(num_episodes, bool))
+    take = jax.vmap(functools.partial(take_picture, env))
 
-    def step(carry: tuple[Moment, PyTree], _: None) -> tuple[tuple[Moment, PyTree], Any]:
-        moment, memory = carry
-        output, memory = act(network, state.params, state.normalizer, moment.env, memory)
-        action = config.action_distribution.to_action(output.distribution.loc)
-        moment, seen = _hold(config, env, moment, action)
-        return (moment, memory), seen
-
-    actions = math.ceil(num_steps / config.action_repeat)
-    num_steps = actions * config.action_repeat
-    (end, _), (pictures, shown) = jax.lax.scan(step, (moment, memory), length=actions)
-    first = (jax.vmap(lambda s: take_picture(env, s))(start), jnp.ones(num_episodes, bool))
-    pictures, shown = jax.tree.map(
-        lambda a, rest: jnp.concatenate([a[None], rest.reshape(num_steps, *rest.shape[2:])]),
-        first,
-        (pictures, shown),
-    )
-    return Recording(pictures, shown, end.episode.episode_return, end.episode.length, end.over)
-
-
-def _hold(config: Config, env: Env, moment: Moment, action: Array) -> tuple[Moment, Any]:
-    """Holds `action` [N, A] for its control steps; an ended episode stands still."""
-
-    def once(moment: Moment, _: None) -> tuple[Moment, Any]:
-        env_state, episode = one_control_step(env, moment.env, moment.episode, action)
+    def step(progress: Progress, _: None) -> tuple[Progress, tuple[Picture, Array]]:
+        output, memory = act(network, state, progress.env, progress.memory)
+        action = distributions.to_action(output.distribution.loc)
+        following = advance(env, progress, action, memory)
         # A lost state is not drawn: it has numbers that no camera can point at.
-        lost = jax.vmap(is_lost)(env_state)
-        alive = ~moment.over & ~lost
-        over = moment.over | lost | env_state.terminated | env_state.truncated
-        env_state, episode = select(alive, (env_state, episode), (moment.env, moment.episode))
-        picture = jax.vmap(lambda s: take_picture(env, s))(env_state)
-        return Moment(env_state, episode, over), (picture, alive)
+        return following, (take(following.env), ~progress.over & ~following.lost)
 
-    return jax.lax.scan(once, moment, length=config.action_repeat)
+    begin = start(config, env, state, key, num_episodes)
+    end, later = jax.lax.scan(step, begin, length=num_steps)
+    first = (take(begin.env), jnp.ones(num_episodes, bool))
+    pictures, shown = jax.tree.map(lambda a, rest: jnp.concatenate([a[None], rest]), first, later)
+    return Recording(pictures, shown, end.episode.episode_return, end.episode.length, end.over)
 
 
 def take_picture(env: Any, state: State) -> Picture:

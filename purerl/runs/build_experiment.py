@@ -7,13 +7,16 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from purerl.devices import compilation
-from purerl.ppo.config import Config
-from purerl.core.env import Env, EnvError, check_members, check_shapes
+from purerl.core.env import Env, EnvError
 from purerl.core.errors import RunError, UserError, one_line, own_line
-from purerl.runs.experiment import Experiment
-from purerl.ppo.networks import check_network
 from purerl.core.records import Network
+from purerl.devices.check_sizes import check_minibatches
+from purerl.devices.programs import abstract_state
+from purerl.ppo.config import Config
+from purerl.ppo.learner import is_recurrent
+from purerl.runs.check_env import check_members, check_shapes
+from purerl.runs.check_network import check_network
+from purerl.runs.experiment import Experiment
 
 
 class Setup(NamedTuple):
@@ -42,7 +45,8 @@ def build(chosen: Experiment) -> Setup:
         with blame(env):
             check_network(network, zeros, env.action_size)
             # Sizes that do not fit together show here, in a second.
-            compilation.abstract_state(*setup[:3])
+            abstract = abstract_state(*setup[:3])
+            check_minibatches(setup.config, is_recurrent(abstract.carry), setup.config.num_envs)
     except (ValueError, ImportError) as error:
         raise UserError(one_line(error)) from error
     return setup

@@ -19,10 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from purerl.runs import array_files
 from purerl.core.errors import UserError, one_line
-from purerl.runs.state_arrays import Leaves, digest_leaves, leaf_paths, unflatten
 from purerl.core.records import PyTree, is_key
+from purerl.runs import array_files
+from purerl.runs.state_arrays import Leaves, digest_leaves, leaf_paths, unflatten
 
 
 class DamagedError(Exception):

@@ -16,33 +16,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import tyro
 
 import purerl
-
 from purerl.core.errors import UserError, one_line, unknown
-
-if TYPE_CHECKING:
-    from purerl.ppo.config import Config
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """When and how the policy is evaluated during training; never changes training by a bit."""
-
-    num_episodes: int = 32
-    """Whole episodes in each evaluation."""
-    number: int = 10
-    """Evaluations over the run, evenly spaced, the last one at the end; 0: none."""
-
-    def __post_init__(self) -> None:
-        """Checks the rules."""
-        if self.num_episodes < 1:
-            raise ValueError(f"num_episodes is {self.num_episodes}; it must be at least 1.")
-        if self.number < 0:
-            raise ValueError(f"number is {self.number}; it must be at least 0.")
+from purerl.ppo.config import Config, Evaluation
 
 
 @dataclass(frozen=True)
@@ -58,7 +38,7 @@ class Experiment:
     env: Any
     build_network: Callable[[Any, Any, int], Any]
     network: Any
-    ppo: "Config"
+    ppo: Config
     seed: Annotated[int, tyro.conf.arg(help="Seed of everything random in the run.")] = 1
     engine: Annotated[
         Literal["auto", "c", "jax", "warp"],

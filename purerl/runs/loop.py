@@ -14,15 +14,13 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import numpy as np
 
-from purerl.runs import checkpoint
-from purerl.runs import state_arrays
-from purerl.devices.compilation import Programs
-from purerl.ppo.config import Config
 from purerl.core.errors import RunError, StoppedError
-from purerl.runs.experiment import Evaluation
+from purerl.core.records import Metrics, PyTree, TrainState, count_as_int
+from purerl.devices.programs import Programs
+from purerl.ppo.config import Config, Evaluation
+from purerl.runs import checkpoint, state_arrays
 from purerl.runs.loggers import Record, Say, summarize
 from purerl.runs.writer import Recorder
-from purerl.core.records import Metrics, PyTree, TrainState, count_as_int
 
 MAX_SKIPPED_IN_A_ROW = 10
 DEFAULT_LINES = 500  # in metrics.jsonl, about

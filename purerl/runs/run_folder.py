@@ -10,15 +10,13 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-from purerl.runs import checkpoint
-from purerl.devices import compilation
-from purerl.runs import experiment
-from purerl.runs import manifest
-from purerl.runs.build_experiment import Setup, build, physics_hash
 from purerl.core.errors import UserError, one_line
+from purerl.core.records import TrainState
+from purerl.devices.programs import abstract_state
+from purerl.runs import checkpoint, experiment, manifest
+from purerl.runs.build_experiment import Setup, build, physics_hash
 from purerl.runs.experiment import Experiment, Source
 from purerl.runs.loggers import Say
-from purerl.core.records import TrainState
 
 LOCK = ".lock"
 OURS = {LOCK, "config.json", "manifest.json", "experiment.py", "metrics.jsonl", "checkpoints"}
@@ -173,7 +171,7 @@ def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> Run:
     setup = build(chosen)
     for what in changed_since(begun, source, setup):
         say(f"{what} is not that of the run any more.")
-    abstract = compilation.abstract_state(*setup[:3])
+    abstract = abstract_state(*setup[:3])
     abstract = abstract.replace(env=None, episode=None, optimizer=None)
     return Run(chosen, setup, _choose(folder / "checkpoints", update, abstract, say), settings)
 

@@ -13,18 +13,14 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from purerl.runs import checkpoint
-from purerl.devices import compilation
-from purerl.runs import console
-from purerl.devices import processes
-from purerl.runs import manifest
-from purerl.runs import run_folder
-from purerl.runs import loop
-from purerl.devices.processes import alone
-from purerl.runs.loggers import BackgroundLogger, Say, TensorBoardSink, WandbSink, check_installed
-from purerl.runs.writer import Recorder
-from purerl.runs.video_process import RunVideo
 from purerl.core.records import PyTree, TrainState
+from purerl.devices import processes
+from purerl.devices.processes import alone
+from purerl.devices.programs import Programs
+from purerl.runs import checkpoint, console, loop, manifest, run_folder
+from purerl.runs.loggers import BackgroundLogger, Say, TensorBoardSink, WandbSink, check_installed
+from purerl.runs.video_process import RunVideo
+from purerl.runs.writer import Recorder
 
 if TYPE_CHECKING:
     from purerl.run import Options
@@ -34,7 +30,7 @@ def train_together(
     folders: list[Path],
     seeds: list[int],
     plan: loop.Plan,
-    programs: Callable[[], compilation.Programs],
+    programs: Callable[[], Programs],
     abstract: PyTree,
     facts: dict[str, Any],
     options: "Options",
@@ -106,7 +102,7 @@ def first_state(
     found: bool,
     saved: list[checkpoint.Saved],
     seeds: list[int],
-    programs: compilation.Programs,
+    programs: Programs,
     abstract: PyTree,
     say: Say,
 ) -> TrainState:

@@ -14,24 +14,19 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 
-from purerl.runs import build_experiment
-from purerl.runs import checkpoint
-from purerl.devices import compilation
-from purerl.runs import console
-from purerl.devices import processes
-from purerl.exact import xla_flags
-from purerl.runs import manifest
-from purerl.ppo import algorithm
-from purerl.runs import run_folder
-from purerl.devices import multi_device
-from purerl.runs import loop
-from purerl.ppo.config import Config
-from purerl.devices.processes import alone
 from purerl.core.errors import RunError, UserError
-from purerl.runs.experiment import Evaluation, Experiment, Source
-from purerl.runs.seed_group import needed_loggers, train_together
-from purerl.devices.shards import Shards, check_sizes
 from purerl.core.records import PyTree
+from purerl.devices import compilation, processes
+from purerl.devices.check_sizes import check_minibatches, check_shards
+from purerl.devices.processes import alone
+from purerl.devices.programs import Programs, abstract_state, compile_programs
+from purerl.devices.shards import Shards
+from purerl.exact import xla_flags
+from purerl.ppo.config import Config
+from purerl.ppo.learner import is_recurrent
+from purerl.runs import build_experiment, checkpoint, console, loop, manifest, run_folder
+from purerl.runs.experiment import Experiment, Source
+from purerl.runs.seed_group import needed_loggers, train_together
 
 if TYPE_CHECKING:
     from purerl.run import Options
@@ -60,7 +55,7 @@ def execute(
     cache = compilation.set_up_jax(options.cache)
     with compilation.no_collection():
         setup = build_experiment.build(chosen)
-        abstract = compilation.abstract_state(*setup[:3])
+        abstract = abstract_state(*setup[:3])
     begun_with = alone(lambda: shards_on_disk(runs))
     shards = choose_shards(setup.config, abstract, options, begun_with)
     plan = loop.make_plan(setup.config, chosen.evaluation, options.checkpoints, options.log_every)
@@ -83,8 +78,12 @@ def execute(
         fresh = alone(prepare)
 
     @functools.cache
-    def programs() -> compilation.Programs:
-        made = compile_programs(setup, chosen.evaluation, fresh, vmapped, shards)
+    def programs() -> Programs:
+        calls_host = setup.engine == "c"
+        with build_experiment.blame(setup.env):
+            made = compile_programs(
+                *setup[:3], chosen.evaluation, fresh, shards, vmapped, calls_host
+            )
         if jax.default_backend() == "gpu" and processes.is_first():
             reasons = manifest.inexact_because(setup.engine, facts["kernels"], made.unordered)
             for folder in runs:
@@ -120,17 +119,6 @@ def describe_process(
     return facts
 
 
-def compile_programs(
-    setup: build_experiment.Setup, evaluation: Evaluation, fresh: bool, vmapped: int, shards: Shards
-) -> compilation.Programs:
-    """Compiles what the run calls: on one device, or on those that share the shards."""
-    calls_host = setup.engine == "c"
-    with compilation.no_collection(), build_experiment.blame(setup.env):
-        if shards.number > 1:
-            return multi_device.compile_programs(*setup[:3], evaluation, fresh, shards)
-        return compilation.compile_programs(*setup[:3], evaluation, fresh, vmapped, calls_host)
-
-
 def shards_on_disk(folders: Iterable[Path]) -> int:
     """Returns how many shards a run was begun with, 0 if there is none yet."""
     begun = [folder for folder in folders if (folder / "config.json").exists()]
@@ -160,8 +148,9 @@ def choose_shards(config: Config, abstract: PyTree, options: "Options", begun_wi
         )
     shards = Shards(number, devices if number > 1 else 1)
     try:
-        check_sizes(shards, config.num_envs)
-        algorithm.check_sizes(config, abstract.carry, number)
+        check_shards(shards, config.num_envs)
+        name = "num_envs / num_shards" if number > 1 else "num_envs"
+        check_minibatches(config, is_recurrent(abstract.carry), config.num_envs // number, name)
     except ValueError as error:
         raise UserError(str(error)) from error
     return shards

@@ -9,9 +9,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from purerl.runs import checkpoint
-from purerl.runs import state_arrays
 from purerl.core.errors import RunError, one_line
+from purerl.runs import checkpoint, state_arrays
 from purerl.runs.loggers import BackgroundLogger, MetricsFile, Record, Say
 
 

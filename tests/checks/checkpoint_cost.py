@@ -16,7 +16,7 @@ from typing import Any
 
 import jax
 
-from purerl.devices import compilation
+from purerl.devices import programs
 from purerl.ppo import algorithm
 from purerl.run import from_command_line
 from purerl.runs import build_experiment, checkpoint, console, experiment, state_arrays
@@ -39,7 +39,7 @@ def main() -> None:
     set_up_jax(True)
     setup = build_experiment.build(chosen)
     state = jax.jit(functools.partial(algorithm.init, *setup[:3]))(jax.random.key(1))
-    abstract = compilation.abstract_state(*setup[:3])
+    abstract = programs.abstract_state(*setup[:3])
     jax.block_until_ready(state)
     with tempfile.TemporaryDirectory() as folder:
         leaves, holds_up = median(lambda: state_arrays.flatten(state))

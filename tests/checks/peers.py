@@ -10,7 +10,7 @@ pytest.importorskip("gymnasium", reason="needs the extra peers")
 import gymnasium  # noqa: E402
 
 from envs import gymnasium_ant  # noqa: E402
-from purerl.core.env import check_env  # noqa: E402
+from purerl.runs.check_env import check_env  # noqa: E402
 
 STEPS = 200
 
@@ -95,7 +95,7 @@ def test_both_trainers_learn_with_equal_sizes():
     assert (model.n_steps, model.n_envs, model.batch_size) == (256, 2, 64)
     config, network = peers.our_config(sizes), peers.our_network(sizes)
     assert config.steps_per_update == 512
-    assert config.samples_per_update // config.num_minibatches == sizes.minibatch
+    assert config.steps_per_update // config.num_minibatches == sizes.minibatch
     built = peers.experiment.build_network(network, jnp.zeros(105), 8)
     params = built.init(jax.random.key(0))[0]
     number = sum(x.size for x in jax.tree.leaves(params))
@@ -127,9 +127,9 @@ def test_braxs_settings_make_the_same_update(body):
 
     sizes = brax_peer.BODIES[body]
     config = brax_peer.our_experiment(body, "mjx", sizes, 10**8).ppo
-    assert config.samples_per_update == sizes.samples
+    assert config.steps_per_update == sizes.samples
     assert sizes.batch_size * sizes.num_minibatches % sizes.num_envs == 0  # brax's own rule
-    minibatch = config.samples_per_update // config.num_minibatches
+    minibatch = config.steps_per_update // config.num_minibatches
     assert minibatch == sizes.batch_size * sizes.unroll_length
     assert config.segment_length == sizes.unroll_length
 

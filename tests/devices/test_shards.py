@@ -16,11 +16,10 @@ import numpy as np
 import pytest
 
 from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
-from purerl.devices import multi_device, shards
+from purerl.devices import programs, shards
 from purerl.exact import pallas_calls, xla_flags
-from purerl.ppo import running_moments
+from purerl.ppo.config import Evaluation
 from purerl.runs import build_experiment, checkpoint
-from purerl.runs.experiment import Evaluation
 from tests.runs import toy_experiment
 from tests.runs.test_run import ROOT, TOY
 
@@ -161,9 +160,9 @@ def test_what_is_set_apart_stays_as_it_is(by_kernel, monkeypatch):
 def test_a_shard_and_what_shards_send_are_copied_by_a_kernel(monkeypatch):
     """On a CPU bits are the same without, nearly always."""
     monkeypatch.setattr(pallas_calls, "can_run", lambda: True)
-    cut = shards.Shards(2)
+    parts = shards.parts_of(shards.Shards(2))
     weight = jnp.ones(3)
-    run = jax.make_jaxpr(lambda x: shards.total(cut, lambda y: (weight * y).sum(0), x))
+    run = jax.make_jaxpr(lambda x: parts.sum(lambda y: (weight * y).sum(0), x))
     closed = run(jnp.ones((2, 5, 3)))
 
     def passes(jaxpr):  # in order, and how many arrays each
@@ -187,7 +186,7 @@ def test_what_learns_from_several_shards_is_compiled_without_them(monkeypatch):
     monkeypatch.setattr(xla_flags, "equal_passes", lambda: {"xla_no_such_option": "1"})
     config, env, network, _ = build_experiment.build(toy_experiment.experiment)
     with pytest.raises(Exception, match="xla_no_such_option"):
-        multi_device.compile_programs(
+        programs.compile_programs(
             config, env, network, Evaluation(number=0), True, shards.Shards(2)
         )
 
@@ -256,27 +255,3 @@ def test_sizes_that_do_not_divide(tmp_path, words, rule):
     said = start(tmp_path, 3, str(TOY), *words, expect=USAGE)
     assert rule in said and "Traceback" not in said
     assert not (tmp_path / "toy_experiment").exists()
-
-
-# --- the arithmetic ---
-
-
-def test_shards_add_in_one_order_whatever_their_number():
-    x = jax.random.normal(jax.random.key(0), (7, 3)) * 10.0 ** jnp.arange(7)[:, None]
-    a, b, c, d, e, f, g = np.asarray(x)
-    expected = ((a + d) + (c + f)) + ((b + e) + g)
-    np.testing.assert_allclose(shards.add_in_order(x), expected, rtol=1e-6)
-    assert shards.add_in_order(jnp.array([1e8, 1.0, -1e8, 1.0])) == 2.0  # (a + c) + (b + d)
-
-
-def test_pooled_moments_are_those_of_all_samples():
-    samples = jax.random.normal(jax.random.key(1), (4, 5, 2)) * 3.0 + 40.0
-    valid = jax.random.bernoulli(jax.random.key(2), 0.7, (4, 5)).at[1].set(False)
-    start = running_moments.update(
-        running_moments.init(jnp.zeros(2)), samples[0] + 1.0, jnp.ones(5, bool)
-    )
-    parts = jax.vmap(lambda x, v: running_moments.moments(start, x, v))(samples, valid)
-    pooled = running_moments.merge(start, running_moments.pool(parts))
-    whole = running_moments.update(start, samples.reshape(20, 2), valid.reshape(20))
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), pooled, whole)
-    assert pooled.count.low == 5 + valid.sum()

@@ -14,8 +14,8 @@ import pytest
 
 from envs import arenas, brax_env, cartpole_swingup, run
 from envs.bodies import ANT
-from purerl.core.env import check_env
 from purerl.physics.interface import PhysicsState
+from purerl.runs.check_env import check_env
 from tests import quick
 
 BUILDERS = {"ant": run.build, "cartpole": cartpole_swingup.build}

@@ -12,7 +12,7 @@ from dm_control.utils import rewards
 
 from envs.suite import base, hopper, tasks
 from envs.suite.rewards import SIGMOIDS, tolerance
-from purerl.core.env import check_env
+from purerl.runs.check_env import check_env
 from tests import quick
 
 STATES = 100

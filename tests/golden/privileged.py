@@ -8,8 +8,8 @@ from envs import cartpole_swingup
 from purerl.core.env import State
 from purerl.core.records import Array
 from purerl.ppo import networks
-from purerl.ppo.config import Config
-from purerl.runs.experiment import Evaluation, Experiment
+from purerl.ppo.config import Config, Evaluation
+from purerl.runs.experiment import Experiment
 
 
 @dataclass(frozen=True)

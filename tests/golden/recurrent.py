@@ -2,8 +2,8 @@
 
 from envs import cartpole_swingup
 from purerl.ppo import networks
-from purerl.ppo.config import Config
-from purerl.runs.experiment import Evaluation, Experiment
+from purerl.ppo.config import Config, Evaluation
+from purerl.runs.experiment import Experiment
 
 experiment = Experiment(
     build_env=cartpole_swingup.build,

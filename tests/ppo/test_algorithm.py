@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 
 from purerl.core.env import State
+from purerl.core.parts import WHOLE, as_one_part
 from purerl.core.records import count_as_int
-from purerl.devices import compilation, slices
-from purerl.devices.shards import Shards, move
-from purerl.ppo import algorithm, batches, evaluation, learner, losses, networks, running_moments
-from purerl.ppo.batches import Batch
+from purerl.ppo import algorithm, batches, evaluation, learner, networks, optimizer, running_moments
 from purerl.ppo.rollout import rollout
-from purerl.runs.experiment import Evaluation
 from tests import quick
+from tests.ppo.test_running_moments import update as merge_batch
 
 MLP = networks.MlpOptions(policy_hidden=(8,), value_hidden=(8,))
 GRU = networks.RecurrentOptions(hidden=8, encoder=(8,), value_hidden=(8,))
@@ -30,7 +28,6 @@ CONFIG = algorithm.Config(
     episode_length=LENGTH,
     gamma=0.9,
     learning_rate=1e-2,
-    reset_pool=18,
 )
 
 
@@ -79,8 +76,14 @@ def setup(config=CONFIG, env=None, recurrent=False, seed=0):
     network = NETWORKS[recurrent]
     state = INIT(config, env, network, jax.random.key(seed))
     samples = jax.random.normal(jax.random.key(9), (50, 2)) * 2.0 + 0.3
-    statistics = running_moments.update(state.normalizer, samples, jnp.ones(50, bool))
+    statistics = merge_batch(state.normalizer, samples, jnp.ones(50, bool))
     return env, network, state.replace(normalizer=statistics)
+
+
+def learn(config, network, state, batch, memory):
+    """Learns from one part."""
+    batch, memory, number = as_one_part((batch, memory, jnp.zeros((), jnp.int32)))
+    return learner.learn(config, network, state, batch, memory, number, WHOLE)
 
 
 @pytest.mark.parametrize("recurrent", [False, True])
@@ -99,9 +102,7 @@ def test_statistics_are_frozen_until_the_end_of_the_update():
     assert count_as_int(after.normalizer.count) == 50
     updated, _ = UPDATE(CONFIG, env, network, state)
     assert count_as_int(updated.normalizer.count) == 50 + 6 * 16
-    expected = running_moments.update(
-        state.normalizer, transitions.observation, jnp.ones((16, 6), bool)
-    )
+    expected = merge_batch(state.normalizer, transitions.observation, jnp.ones((16, 6), bool))
     np.testing.assert_allclose(
         updated.normalizer.mean.value, expected.mean.value, rtol=1e-5, atol=1e-6
     )
@@ -119,51 +120,25 @@ def test_time_limits_truncate_and_the_first_are_staggered():
         assert (np.diff(ends) == LENGTH).all()
     assert not transitions.terminated.any()
     np.testing.assert_array_equal(transitions.truncated, done)
-    np.testing.assert_array_equal(finished.episodes, done.sum(0))
+    np.testing.assert_array_equal(finished["episodes"], done.sum(0))
 
 
-def test_every_start_is_fresh():
-    """No two episodes of an update begin alike, nor do those of the next update."""
+def test_every_environment_and_update_has_a_fresh_start():
+    """One that ends twice in an update begins again as it began before, and that is counted."""
     env, network, state = setup()
-    starts = []
     update = partial(UPDATE, CONFIG, env, network)
+    starts = set(np.asarray(state.env.physics["x"]).tolist())
     for _ in range(2):
         _, transitions, _, _ = ROLLOUT(CONFIG, env, network, state)
-        first = np.concatenate([np.zeros((1, 6), bool), np.asarray(transitions.done)[:-1]])
-        starts += np.asarray(transitions.observation)[first][:, 0].tolist()
+        done = np.asarray(transitions.done)[:-1]
+        begins = np.asarray(transitions.observation)[1:, :, 0]
+        for b in range(6):
+            own = set(begins[done[:, b], b].tolist())
+            assert len(own) == 1 and not own & starts
+            starts |= own
         state, metrics = update(state)
-        assert metrics["replayed_resets"] == 0
-    assert len(starts) > 20 and len(set(starts)) == len(starts)
-
-
-def test_replayed_starts_are_counted():
-    config = dataclasses.replace(CONFIG, reset_pool=6)
-    env, network, state = setup(config)
-    _, transitions, finished, _ = ROLLOUT(config, env, network, state)
-    _, metrics = UPDATE(config, env, network, state)
-    ends = np.asarray(transitions.done).sum(0)
-    assert metrics["replayed_resets"] == np.maximum(ends - 1, 0).sum() > 0
-
-
-def test_a_shared_pool_gives_each_start_to_several_environments():
-    config = dataclasses.replace(CONFIG, reset_pool=2, num_envs=6)
-    env, network, state = setup(config)
-    _, transitions, _, _ = ROLLOUT(config, env, network, state)
-    _, metrics = UPDATE(config, env, network, state)
-    done = np.asarray(transitions.done)
-    begins = np.asarray(transitions.observation)[1:][done[:-1]][:, 0]
-    places = np.nonzero(done[:-1])[1]
-    for parity in (0, 1):
-        assert len(set(begins[places % 2 == parity].tolist())) == 1
-    assert len(set(begins.tolist())) == 2
-    ends = done.sum(0)
-    assert metrics["replayed_resets"] == sum(ends[p::2].sum() - 1 for p in (0, 1)) > 0
-
-
-@pytest.mark.parametrize("pool", [-1, 4, 9])
-def test_a_pool_that_cannot_be_shared_evenly_is_refused(pool):
-    with pytest.raises(ValueError, match=f"reset_pool is {pool}; with num_envs = 6"):
-        dataclasses.replace(CONFIG, reset_pool=pool)
+        ends = np.asarray(transitions.done).sum(0)
+        assert metrics["replayed_resets"] == np.maximum(ends - 1, 0).sum() > 0
 
 
 @pytest.mark.parametrize(
@@ -173,7 +148,7 @@ def test_where_the_learning_rate_of_an_update_comes_from(schedule, update, rate)
     """100 updates; 0.5 is the setting, 0.1 what the state was left with."""
     config = dataclasses.replace(CONFIG, schedule=schedule, learning_rate=0.5)
     state = setup()[2].replace(learning_rate=jnp.float32(0.1), update=jnp.int32(update))
-    assert learner.scheduled_rate(config, state) == pytest.approx(rate)
+    assert optimizer.scheduled_rate(config, state) == pytest.approx(rate)
 
 
 def slow_batch(transitions, last_value, observations_before_reset, value_of, gamma, lambda_):
@@ -274,21 +249,6 @@ def test_segments_stay_whole_and_are_renewed_before_each_gradient_step(monkeypat
     assert {column.tobytes() for column in epoch.T} == {column.tobytes() for column in whole.T}
 
 
-@pytest.mark.parametrize("cut", [Shards(), Shards(2)])
-def test_advantages_of_a_minibatch_are_scaled_by_its_own(cut):
-    shape = (2, 1, 12) if cut.number > 1 else (1, 12)
-    advantage = jax.random.normal(jax.random.key(0), shape)
-    weight = jax.random.bernoulli(jax.random.key(1), 0.8, shape).astype(jnp.float32)
-    batch = Batch(*[advantage] * 8)._replace(weight=weight)
-    order = learner.shuffle(jax.random.key(2), 12, 3, cut)  # 3 minibatches
-    found = learner.scales_of_all(batch, order, cut)
-    for k in range(3):
-        part, _ = move(cut, learner._take, batch, (), order[k])
-        expected = losses.advantage_scale(part.advantage, part.weight)
-        for one, other in zip(found, expected, strict=True):
-            np.testing.assert_allclose(one[k], other, rtol=1e-5)
-
-
 def test_recurrent_memory_restarts_with_each_episode_in_rollout_and_learner():
     """The learner's unroll, from the stored memory, gives the rollout's values bit for bit."""
     env, network, state = setup(recurrent=True)
@@ -306,20 +266,6 @@ def test_recurrent_memory_restarts_with_each_episode_in_rollout_and_learner():
     features = batch.observation[t, b]
     fresh = network.apply(state.params, features, jnp.zeros(8))[0].value
     np.testing.assert_allclose(transitions.value[t, b], fresh, rtol=1e-5, atol=1e-6)
-
-
-def test_action_repeat_stops_at_the_end_of_an_episode():
-    """Episodes of 7 control steps, actions held for 3: 3 + 3 + 1, and rewards add up."""
-    config = dataclasses.replace(CONFIG, action_repeat=3, rollout_length=8)
-    env, network, state = setup(config)
-    state = state.replace(episode=state.episode.replace(limit=jnp.full(6, LENGTH, jnp.int32)))
-    _, transitions, finished, _ = ROLLOUT(config, env, network, state)
-    action = np.tanh(np.asarray(transitions.raw_action)[..., 0])
-    held = np.tile(np.array([3, 3, 1])[:, None], (3, 6))[:8]
-    np.testing.assert_allclose(transitions.reward, action * held, rtol=1e-5, atol=1e-6)
-    np.testing.assert_array_equal(np.asarray(transitions.done)[:, 0], held[:, 0] == 1)
-    np.testing.assert_array_equal(finished.length / finished.episodes, LENGTH)
-    np.testing.assert_array_equal(finished.metrics["moves_count"] / finished.episodes, LENGTH)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -353,7 +299,9 @@ def test_a_blown_up_environment_is_contained():
     after, sound, _, _ = ROLLOUT(CONFIG, sound_env, network, state)
     contained, lost, finished, _ = ROLLOUT(CONFIG, broken_env, network, state)
     assert (~np.asarray(lost.valid)).sum(0).tolist()[3] >= 1
-    assert finished.nonfinite_resets.sum() == (~lost.valid).sum() == finished.nonfinite_resets[3]
+    assert (
+        finished["nonfinite_resets"].sum() == (~lost.valid).sum() == finished["nonfinite_resets"][3]
+    )
     for a, b in zip(jax.tree.leaves(sound), jax.tree.leaves(lost), strict=True):
         others = [0, 1, 2, 4, 5]
         np.testing.assert_array_equal(np.asarray(a)[:, others], np.asarray(b)[:, others])
@@ -380,30 +328,9 @@ def test_a_lost_sample_has_no_weight_in_the_update():
     learned = []
     for x in (lost, odd):
         batch = batches.make_batch(CONFIG, state, x, last_value, state.episode.length == 0)
-        learned.append(learner.learn(CONFIG, network, state, batch, ())[0])
+        learned.append(learn(CONFIG, network, state, batch, ())[0])
     for a, b in zip(*(jax.tree.leaves(x.params) for x in learned), strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-@pytest.mark.parametrize(
-    "recurrent, segment_length, size",
-    [(False, 0, (1, 32)), (True, 0, (16, 2)), (False, 4, (4, 8))],
-)
-def test_a_gradient_in_slices_is_the_same_sum(monkeypatch, recurrent, segment_length, size):
-    """As on a GPU: of 3 minibatches of samples, sequences or segments, each in 2 slices."""
-    env, network, state = setup(recurrent=recurrent)
-    config = dataclasses.replace(CONFIG, segment_length=segment_length)
-    memory = state.carry  # before the rollout
-    after, transitions, _, last_value = ROLLOUT(config, env, network, state)
-    batch = batches.make_batch(config, after, transitions, last_value, state.episode.length == 0)
-    whole, metrics = learner.learn(config, network, after, batch, memory)
-    asked = []
-    monkeypatch.setattr(learner, "count_slices", lambda *size: asked.append(size) or 2)
-    sliced, others = learner.learn(config, network, after, batch, memory)
-    assert asked == [(*size, "cpu")]
-    for a, b in zip(jax.tree.leaves(whole.params), jax.tree.leaves(sliced.params), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-4)
-    assert float(others["value_loss"]) == pytest.approx(float(metrics["value_loss"]), rel=1e-3)
 
 
 def altered(network, change):
@@ -414,14 +341,6 @@ def altered(network, change):
         return change(params, carry)
 
     return network._replace(init=init)
-
-
-def test_parameters_that_no_gradient_changes_are_refused():
-    whole = altered(
-        NETWORKS[False], lambda params, carry: (params | {"table": jnp.arange(3)}, carry)
-    )
-    with pytest.raises(ValueError, match=r"\['table'\] is int32: parameters are trained"):
-        jax.eval_shape(partial(algorithm.init, CONFIG, Walk(), whole), jax.random.key(0))
 
 
 def test_parameters_of_half_precision_stay_so():
@@ -455,7 +374,7 @@ def test_what_a_network_cannot_read_is_told():
     networks.mlp(MLP, {"policy": zeros, "privileged": zeros}, 1)
 
 
-@pytest.mark.parametrize(("name", "value"), [("value_clip", -1.0), ("entropy_weight", jnp.nan)])
+@pytest.mark.parametrize(("name", "value"), [("value_weight", -1.0), ("entropy_weight", jnp.nan)])
 def test_weights_have_a_sign(name, value):
     assert name in unmade(lambda: dataclasses.replace(CONFIG, **{name: value}))
 
@@ -474,34 +393,18 @@ def test_a_memory_may_hold_integers():
     evaluation.evaluate(CONFIG, Walk(), counting, state, jax.random.key(1), 2)
 
 
-@pytest.mark.parametrize(
-    "rows, columns, platform, number",
-    [
-        (1, 10240, "gpu", 16),
-        (1, 10240, "cpu", 1),
-        (1, 1024, "gpu", 4),  # 256 samples a slice at least
-        (1, 255, "gpu", 1),
-        (1, 5 * 512, "gpu", 8),
-        (32, 64, "gpu", 8),  # of sequences, whole ones
-        (32, 63, "gpu", 1),
-    ],
-)
-def test_slices_are_equal_and_not_too_small(rows, columns, platform, number):
-    assert slices.count_slices(rows, columns, platform) == number
-
-
 def test_a_non_finite_minibatch_is_skipped_and_counted():
     env, network, state = setup()
     _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
     broken = transitions._replace(reward=transitions.reward.at[:].set(jnp.nan))
     batch = batches.make_batch(CONFIG, state, broken, last_value, state.episode.length == 0)
-    after, metrics = learner.learn(CONFIG, network, state, batch, ())
+    after, metrics = learn(CONFIG, network, state, batch, ())
     assert metrics["skipped_minibatches"] == metrics["skipped_in_a_row"] == 6
     assert np.isfinite(metrics["policy_loss"])
     for a, b in zip(jax.tree.leaves(state.params), jax.tree.leaves(after.params), strict=True):
         np.testing.assert_array_equal(a, b)
     sound = batches.make_batch(CONFIG, state, transitions, last_value, state.episode.length == 0)
-    again, _ = learner.learn(CONFIG, network, after, sound, ())
+    again, _ = learn(CONFIG, network, after, sound, ())
     assert again.skipped_in_a_row == 0
 
 
@@ -522,9 +425,9 @@ def test_linear_schedule_and_exact_budget():
 @pytest.mark.parametrize(("kl", "factor"), [(0.001, 1.5), (0.01, 1.0), (0.1, 1 / 1.5)])
 def test_adaptive_learning_rate(kl, factor):
     config = dataclasses.replace(CONFIG, schedule="adaptive_kl", desired_kl=0.01)
-    rate = learner.next_rate(config, jnp.asarray(1e-3), jnp.asarray(kl), jnp.asarray(True))
+    rate = optimizer.next_rate(config, jnp.asarray(1e-3), jnp.asarray(kl), jnp.asarray(True))
     np.testing.assert_allclose(rate, 1e-3 * factor, rtol=1e-6)
-    unmoved = learner.next_rate(config, jnp.asarray(1e-3), jnp.asarray(kl), jnp.asarray(False))
+    unmoved = optimizer.next_rate(config, jnp.asarray(1e-3), jnp.asarray(kl), jnp.asarray(False))
     np.testing.assert_allclose(unmoved, 1e-3)
 
 
@@ -571,7 +474,6 @@ def test_update_keeps_rank_promotion_strict():
         ({"num_envs": 0}, ("num_envs is 0", "at least 1")),
         ({"clip": 0.0}, ("clip is 0.0", "above 0")),
         ({"segment_length": -4}, ("segment_length is -4", "0 or above")),
-        ({"segment_length": 5}, ("segment_length = 5", "rollout_length = 16", "4")),
     ],
 )
 def test_impossible_settings_are_refused(changes, words):
@@ -579,42 +481,3 @@ def test_impossible_settings_are_refused(changes, words):
         dataclasses.replace(CONFIG, **changes)
     for word in words:
         assert word in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("recurrent", "minibatches", "words"),
-    [
-        (False, 7, ("num_minibatches = 7", "num_envs * rollout_length = 96", "6, 8", "91 or 98")),
-        (True, 4, ("num_minibatches = 4", "num_envs = 6", "3", "4 or 8", "recurrent")),
-    ],
-)
-def test_sizes_that_do_not_divide(recurrent, minibatches, words):
-    config = dataclasses.replace(CONFIG, num_minibatches=minibatches)
-    with pytest.raises(ValueError) as error:
-        setup(config, recurrent=recurrent)
-    for word in words:
-        assert word in str(error.value)
-
-
-def test_segments_count_in_minibatches_and_are_not_for_recurrent_networks():
-    config = dataclasses.replace(CONFIG, segment_length=8, num_minibatches=16)
-    with pytest.raises(ValueError, match="num_envs \\* rollout_length / segment_length = 12"):
-        setup(config)
-    with pytest.raises(ValueError, match="segment_length is 8, and the network is recurrent"):
-        setup(config, recurrent=True)
-
-
-@pytest.mark.parametrize("recurrent", [False, True])
-def test_on_a_gpu_an_update_is_two_programs_that_make_the_same(recurrent, monkeypatch):
-    env, network, state = setup(recurrent=recurrent)
-    expected, metrics = UPDATE(CONFIG, env, network, state)
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    programs = compilation.compile_programs(CONFIG, env, network, Evaluation(number=0), fresh=False)
-    assert set(programs.seconds) == {"collect", "improve"}
-    updated, seen = programs.update(jax.tree.map(jnp.copy, state))
-    leaves = jax.tree.leaves((seen, updated.params, updated.optimizer, updated.env.physics))
-    originals = jax.tree.leaves(
-        (metrics, expected.params, expected.optimizer, expected.env.physics)
-    )
-    for x, y in zip(leaves, originals, strict=True):
-        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from purerl.ppo import advantages, algorithm, losses, networks, running_moments
+from purerl.ppo import advantages, algorithm, distributions, losses, networks, running_moments
 from purerl.ppo.rollout import act
 from tests import quick
 from tests.ppo.probes import Probe
@@ -38,8 +38,8 @@ def answers(network, state, observations):
     example = jax.tree.map(lambda x: x[: len(observations)], state.env)
     shown = example.replace(observation=jnp.asarray(observations, jnp.float32)[:, None])
     memory = jax.tree.map(lambda x: x[: len(observations)], state.carry)
-    output, _ = act(network, state.params, state.normalizer, shown, memory)
-    action = CONFIG.action_distribution.to_action(output.distribution.loc)
+    output, _ = act(network, state, shown, memory)
+    action = distributions.to_action(output.distribution.loc)
     return output.value.tolist(), action[:, 0].tolist()
 
 
@@ -74,7 +74,7 @@ def test_probe_is_solved(name):
     assert errors(name) < TOLERANCE
 
 
-def no_value_gradient(value, old_value, target, clip):
+def no_value_gradient(value, target):
     return jnp.zeros_like(value)
 
 
@@ -88,10 +88,6 @@ def undiscounted(reward, value, next_value, terminated, gamma):
 
 def ascending(log_ratio, advantage, clip):
     return -CLIPPED_SURROGATE(log_ratio, advantage, clip)
-
-
-def without_noise(parameters, noise):
-    return parameters.loc
 
 
 CLIPPED_SURROGATE = losses.clipped_surrogate

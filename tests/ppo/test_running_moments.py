@@ -9,6 +9,11 @@ from purerl.core.records import add_count, count_as_float, count_as_int, zero_co
 from purerl.ppo import running_moments
 
 
+def update(statistics, batch, valid):
+    """Merges a batch into statistics, as an update does."""
+    return running_moments.merge(statistics, running_moments.deviations(statistics, batch, valid))
+
+
 @pytest.fixture(autouse=True)
 def strict():
     with jax.numpy_rank_promotion("raise"):
@@ -17,10 +22,10 @@ def strict():
 
 def merged(batches, valid=None):
     statistics = running_moments.init(jnp.zeros(batches.shape[-1]))
-    update = jax.jit(running_moments.update)
+    jitted = jax.jit(update)
     for i, batch in enumerate(batches):
         mask = jnp.ones(batch.shape[:-1], bool) if valid is None else valid[i]
-        statistics = update(statistics, batch, mask)
+        statistics = jitted(statistics, batch, mask)
     return statistics
 
 
@@ -51,7 +56,7 @@ def test_invalid_samples_leave_no_trace_even_when_nan():
 
 def test_a_batch_without_valid_samples_changes_nothing():
     first = merged(np.ones((1, 4, 2), np.float32) * 3)
-    second = running_moments.update(first, jnp.full((4, 2), jnp.nan), jnp.zeros(4, bool))
+    second = update(first, jnp.full((4, 2), jnp.nan), jnp.zeros(4, bool))
     for before, after in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
         np.testing.assert_array_equal(before, after)
 
@@ -65,7 +70,7 @@ def test_compensation_keeps_increments_below_the_last_bit():
 
     def body(statistics, _):
         batch = jnp.full((4096, 1), 1.5)
-        return running_moments.update(statistics, batch, jnp.ones(4096, bool)), None
+        return update(statistics, batch, jnp.ones(4096, bool)), None
 
     statistics, _ = jax.jit(lambda s: jax.lax.scan(body, s, length=10_000))(statistics)
     seen = 10 * 2**32
@@ -88,7 +93,7 @@ def test_normalize_whitens_clips_and_survives_a_constant_feature():
 def test_dict_observations():
     example = {"policy": jnp.zeros(2), "privileged": jnp.zeros(3)}
     batch = {"policy": jnp.ones((4, 2)), "privileged": jnp.full((4, 3), 2.0)}
-    statistics = running_moments.update(running_moments.init(example), batch, jnp.ones(4, bool))
+    statistics = update(running_moments.init(example), batch, jnp.ones(4, bool))
     np.testing.assert_allclose(statistics.mean["policy"].value, [1, 1])
     np.testing.assert_allclose(statistics.mean["privileged"].value, [2, 2, 2])
 

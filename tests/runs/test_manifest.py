@@ -10,13 +10,15 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from purerl.devices import compilation
+from purerl.devices import programs
+from purerl.devices.shards import Shards
 from purerl.exact import xla_flags
 from purerl.exact.rewrite import list_scatter_sums
 from purerl.ppo import algorithm
+from purerl.ppo.config import Evaluation
 from purerl.runs import manifest
 from purerl.runs.build_experiment import build
-from purerl.runs.experiment import Evaluation, load
+from purerl.runs.experiment import load
 from tests.runs.test_run import ROOT, TOY
 
 
@@ -130,7 +132,7 @@ def test_no_update_has_a_sum_without_a_fixed_order(name):
     source = load(ROOT / "experiments" / f"{name}.py").experiment
     config, env, network, _ = build(dataclasses.replace(source, engine="jax"))
     update = functools.partial(algorithm.update, config, env, network)
-    trace = jax.make_jaxpr(update)(compilation.abstract_state(config, env, network))
+    trace = jax.make_jaxpr(update)(programs.abstract_state(config, env, network))
     assert list_scatter_sums(trace) == []
 
 
@@ -144,12 +146,12 @@ def test_a_sum_without_a_fixed_order_is_found(monkeypatch):
         total = jnp.zeros(2).at[place].add(value)
         return output._replace(value=output.value + 0.0 * total.sum()), carry
 
-    programs = compilation.compile_programs(
-        config, env, network._replace(apply=apply), Evaluation(number=0), fresh=False
+    compiled = programs.compile_programs(
+        config, env, network._replace(apply=apply), Evaluation(number=0), False, Shards()
     )
-    assert programs.unordered
-    assert all("tests/runs/test_manifest.py" in place for place in programs.unordered)
-    reasons = manifest.inexact_because("jax", "fixed", programs.unordered)
+    assert compiled.unordered
+    assert all("tests/runs/test_manifest.py" in place for place in compiled.unordered)
+    reasons = manifest.inexact_because("jax", "fixed", compiled.unordered)
     assert reasons[0].startswith("a sum without a fixed order: scatter")
 
 
@@ -157,9 +159,9 @@ def test_a_run_on_c_imports_no_other_engine():
     """MJX takes most of a second to import, Warp two; a run on engine `c` needs neither."""
     lines = [
         "import sys",
-        "from purerl import building, experiment, manifest",
+        "from purerl.runs import build_experiment, experiment, manifest",
         "chosen = experiment.find('ant_run').experiment",
-        "setup = building.build(chosen)",
+        "setup = build_experiment.build(chosen)",
         "manifest.collect(setup.engine, [chosen.build_env, chosen.build_network])",
         "assert setup.engine == 'c'",
         "print([name for name in sys.modules if name in ('mujoco.mjx', 'warp')])",

@@ -20,18 +20,19 @@ from purerl import run
 from purerl.core import errors
 from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
 from purerl.devices import compilation
+from purerl.devices.programs import compile_programs
 from purerl.devices.shards import Shards
+from purerl.ppo.config import Evaluation
 from purerl.runs import (
     build_experiment,
     checkpoint,
     console,
     loop,
     run_folder,
-    session,
     state_arrays,
     writer,
 )
-from purerl.runs.experiment import Evaluation, find, load
+from purerl.runs.experiment import find, load
 
 TOY = Path(__file__).parent / "toy_experiment.py"
 ROOT = TOY.parent.parent
@@ -212,10 +213,10 @@ def test_a_beginning_has_the_same_bits_however_it_is_compiled(num_shards):
     setup = build_experiment.build(chosen)
     digests = set()
     for fresh in (True, False):  # ahead of time, or when it is called
-        programs = session.compile_programs(
-            setup, chosen.evaluation, fresh, 1, Shards(num_shards, 1)
+        compiled = compile_programs(
+            *setup[:3], chosen.evaluation, fresh, Shards(num_shards, 1), calls_host=True
         )
-        digests.add(state_arrays.digest(programs.init(jax.random.key(1))))
+        digests.add(state_arrays.digest(compiled.init(jax.random.key(1))))
     assert len(digests) == 1
 
 

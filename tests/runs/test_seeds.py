@@ -9,7 +9,7 @@ import pytest
 
 from purerl import run
 from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE, RunError, UserError
-from purerl.devices import compilation
+from purerl.devices import programs
 from purerl.runs import checkpoint, loop, session, state_arrays, writer
 from tests.runs.test_run import ROOT, TOY, Stopper, digest, folder, lines, start
 
@@ -167,7 +167,7 @@ def test_a_lost_seed_is_named(tmp_path, stop_after, capsys):
     from purerl.runs.run_folder import restore
 
     setup = restore(folder(tmp_path, "seed2"), "latest", print).setup
-    state = checkpoint.load(path, compilation.abstract_state(*setup[:3])).state
+    state = checkpoint.load(path, programs.abstract_state(*setup[:3])).state
     state = state.replace(params=jax.tree.map(lambda x: x * 1e30, state.params))
     leaves = state_arrays.flatten(state)
     checkpoint.save(path.parent, leaves, meta | {"digest": state_arrays.digest_leaves(leaves)})

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from purerl.core.env import EnvError, State, check_env
+from purerl.core.env import EnvError, State
+from purerl.runs.check_env import check_env
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,0 +1,59 @@
+"""Checks that sizes divide each other; each raises ValueError with sizes that do."""
+
+from purerl.devices.shards import Shards
+from purerl.ppo.config import Config
+
+
+def check_divides(
+    whole_name: str, whole: int, parts_name: str, parts: int, because: str = ""
+) -> None:
+    """Checks that `parts` divides `whole`; the message has the nearest sizes that do."""
+    if whole % parts == 0:
+        return
+    divisors = [d for d in range(1, whole + 1) if whole % d == 0]
+    nearest = sorted(sorted(divisors, key=lambda d: abs(d - parts))[:3])
+    below, above = whole - whole % parts, whole - whole % parts + parts
+    raise ValueError(
+        f"{parts_name} = {parts} does not divide {whole_name} = {whole}; "
+        f"{parts_name} could be {', '.join(map(str, nearest))}, "
+        f"or {whole_name} could be {' or '.join(str(w) for w in (below, above) if w > 0)}."
+        + because
+    )
+
+
+def check_minibatches(config: Config, recurrent: bool, size: int, name: str = "num_envs") -> None:
+    """Checks that the minibatches divide a rollout.
+
+    Args:
+      config: the settings.
+      recurrent: whether the network has a memory; its minibatches hold whole rollouts.
+      size: environments of the rollout.
+      name: what `size` is called in the message.
+    """
+    if config.segment_length:
+        length = ("segment_length", config.segment_length)
+        check_divides("rollout_length", config.rollout_length, *length)
+    if config.segment_length and recurrent:
+        raise ValueError(
+            f"segment_length is {config.segment_length}, and the network is recurrent, so that its "
+            "minibatches hold whole rollouts; segment_length must be 0."
+        )
+    because = " The minibatches of a recurrent network hold whole rollouts." if recurrent else ""
+    if not recurrent:
+        size, name = size * config.rollout_length, f"{name} * rollout_length"
+    if config.segment_length:
+        size, name = size // config.segment_length, f"{name} / segment_length"
+    check_divides(name, size, "num_minibatches", config.num_minibatches, because)
+
+
+def check_shards(shards: Shards, num_envs: int) -> None:
+    """Checks that the devices divide the shards, and the shards the environments."""
+    if shards.number % shards.devices:
+        below = shards.number - shards.number % shards.devices
+        sizes = [str(size) for size in (1, below, below + shards.devices) if size]
+        raise ValueError(
+            f"num_shards = {shards.number} cannot be shared by {shards.devices} devices; "
+            f"num_shards could be {', '.join(dict.fromkeys(sizes))} (1: a single device is used), "
+            "or show fewer devices."
+        )
+    check_divides("num_envs", num_envs, "num_shards", shards.number)

@@ -1,0 +1,170 @@
+"""A run's compiled programs: its beginning, an update, the evaluation.
+
+They are compiled at the same time, since XLA does not hold Python's lock. On few cores, the
+evaluation is compiled when it is first needed. An update is two programs, which compile side by
+side, with the `c` engine and on a GPU. With MJX on a CPU it is one: a program that only acts, 256
+ants on two cores, never ended (all of XLA's threads waiting, jax 0.10.2), and a whole update does.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+
+from purerl.core.env import Env
+from purerl.core.keys import Purpose, derive
+from purerl.core.records import Array, Metrics, Network, PyTree, TrainState
+from purerl.devices import multi_device
+from purerl.devices.compilation import (
+    Compiling,
+    jit,
+    no_collection,
+    shapes,
+    start,
+    unordered,
+    when_needed,
+)
+from purerl.devices.shards import Shards
+from purerl.ppo import algorithm
+from purerl.ppo.config import Config, Evaluation
+from purerl.ppo.evaluation import evaluate
+
+
+class Programs(NamedTuple):
+    """A run's compiled functions; with S vmapped seeds every array has a leading axis [S].
+
+    `update` and `evaluate` take a TrainState, or what `spread` makes of one for several devices.
+    """
+
+    init: Callable[[Array], TrainState]
+    update: Callable[[Any], tuple[Any, Metrics]]
+    evaluate: Callable[[Any], Metrics]
+    seconds: dict[str, float]  # that each took to compile, side by side; without the evaluation
+    unordered: list[str]  # sums of the update whose order nothing fixes on a GPU
+    spread: Callable[[TrainState], Any] = lambda state: state  # onto the devices, for the others
+    fetch: Callable[[Any], TrainState] = lambda state: state  # back onto one
+
+
+def abstract_state(config: Config, env: Env, network: Network) -> PyTree:
+    """Returns the shapes and dtypes of a run's state without computing anything."""
+    return jax.eval_shape(
+        functools.partial(algorithm.init, config, env, network), jax.random.key(0)
+    )
+
+
+def compile_programs(
+    config: Config,
+    env: Env,
+    network: Network,
+    evaluation: Evaluation,
+    fresh: bool,
+    shards: Shards,
+    vmapped_seeds: int = 1,
+    calls_host: bool = False,
+) -> Programs:
+    """Compiles what a run calls.
+
+    Args:
+      config: the hyperparameters.
+      env: the environment.
+      network: the network.
+      evaluation: whether there are evaluations, and of how many episodes.
+      fresh: whether the run begins, so that `init` is needed.
+      shards: how the batch is cut; more than one are laid out over the devices.
+      vmapped_seeds: S.
+      calls_host: whether the environment's physics does, as the `c` engine.
+    """
+    # Initialisation is a program too: computed operation by operation, it has other bits.
+    init: Any = functools.partial(algorithm.init, config, env, network)
+    judge: Any = functools.partial(evaluate_in_run, config, env, network, evaluation.num_episodes)
+    key, seconds = jax.random.key(0), dict[str, float]()
+    if vmapped_seeds > 1:
+        init, judge = jax.vmap(init), jax.vmap(judge)
+        key = jax.random.split(key, vmapped_seeds)
+    several = dict[str, Any]()
+    with no_collection():
+        abstract = jax.eval_shape(init, key)
+        example = abstract
+        if shards.number > 1:
+            layout = multi_device.make_layout(shards, config.num_envs)
+            compiling = multi_device.compile_update(layout, config, env, network, abstract, seconds)
+            seen = functools.partial(multi_device.one_copy, layout, abstract.carry)
+            example = multi_device.shapes_to_judge(layout, abstract)
+            several["spread"] = functools.partial(multi_device.spread, layout)
+            several["fetch"] = functools.partial(multi_device.fetch, layout)
+        else:
+            in_halves = calls_host or jax.default_backend() == "gpu"
+            compiling = compile_update(
+                config, env, network, abstract, vmapped_seeds > 1, in_halves, seconds
+            )
+            seen = None
+        begin, evaluate = jit("init", init), jit("evaluation", judge)
+        beginning = start("init", begin.trace(key), seconds) if fresh else None
+        if evaluation.number:
+            evaluate = when_needed("evaluation", evaluate, example, seconds)
+        update = compiling.finish()
+    return Programs(
+        init=beginning.result() if beginning else begin,
+        update=update,
+        evaluate=(lambda state: evaluate(seen(state))) if seen else evaluate,
+        seconds=dict(seconds),  # the evaluation's may come later
+        unordered=compiling.unordered,
+        **several,
+    )
+
+
+def evaluate_in_run(
+    config: Config, env: Env, network: Network, num_episodes: int, state: TrainState
+) -> Metrics:
+    """Evaluates the deterministic policy on episodes that depend on seed and update alone."""
+    key = derive(state.key, Purpose.EVALUATION, state.update)
+    return evaluate(config, env, network, state, key, num_episodes)
+
+
+def compile_update(
+    config: Config,
+    env: Env,
+    network: Network,
+    abstract: TrainState,
+    vmapped: bool,
+    in_halves: bool,
+    seconds: dict[str, float],
+) -> Compiling:
+    """Compiles an update on one device, as one program or `in_halves`.
+
+    Args:
+      config: the hyperparameters.
+      env: the environment.
+      network: the network.
+      abstract: shapes of the state; [S, ...] if `vmapped`.
+      vmapped: whether there are several seeds.
+      in_halves: whether acting and learning are programs of their own.
+      seconds: what each program takes is noted in it.
+    """
+    whole: list[tuple[str, Callable]] = [
+        ("update", functools.partial(algorithm.update, config, env, network))
+    ]
+    halves: list[tuple[str, Callable]] = [
+        ("collect", functools.partial(algorithm.collect, config, env, network)),
+        ("improve", functools.partial(multi_device.improve, config, network, Shards())),
+    ]
+    given, traced, started = (abstract,), [], []
+    for name, function in halves if in_halves else whole:
+        function = jax.vmap(function) if vmapped else function
+        traced.append(jit(name, function, donate_argnums=0).trace(*given))
+        started.append(start(name, traced[-1], seconds))
+        given = shapes(traced[-1].out_info)
+
+    def finish() -> Callable[[Any], tuple[Any, Metrics]]:
+        programs = [program.result() for program in started]
+        return functools.partial(update, *programs) if in_halves else programs[0]
+
+    return Compiling(finish, sorted({place for part in traced for place in unordered(part)}))
+
+
+def update(
+    collect: Callable[..., Any], improve: Callable[..., Any], state: TrainState
+) -> tuple[TrainState, Metrics]:
+    """Makes an update of its two halves, as `algorithm.update` does; does not wait for it."""
+    return improve(*collect(state))

@@ -1,0 +1,194 @@
+"""Checks that an environment keeps to the protocol of `purerl.core.env`."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from purerl.core.env import ABSURD, Env, EnvError, State
+from purerl.core.records import Array, PyTree, is_key
+
+
+def check_env(env: Env, num_envs: int = 4, num_steps: int = 4) -> None:
+    """Verifies that an environment keeps to the protocol, by using it as the trainer does.
+
+    Args:
+      env: the environment.
+      num_envs: B, environments stepped together, at least 2.
+      num_steps: T, steps with random actions, after one each with all -1, 0 and 1.
+
+    Raises:
+      EnvError: names the field that broke a rule, and the rule.
+    """
+    check_shapes(env)
+    keys = jax.random.split(jax.random.key(0), num_envs)
+    reset = jax.jit(jax.vmap(env.reset))
+    state = reset(_again(keys))
+    _check_bits("equal keys", state, reset(keys), "reset must be a function of its key alone")
+    _check_differs(state)
+    actions = _actions(num_steps, num_envs, env.action_size)
+    rollout = _rollout(env)
+    last, states = rollout(_again(state), actions)
+    _check_finite("reset", state)
+    _check_finite("step", states)
+    again = rollout(state, actions)[1]
+    _check_bits("equal states and actions", states, again, "step must be a function of both alone")
+    ended = last.replace(terminated=jnp.ones(num_envs, bool))
+    _check_finite("a step after termination", rollout(ended, actions)[1])
+
+
+def check_shapes(env: Env) -> None:
+    """Verifies what of the protocol shows without computing anything; EnvError as `check_env`."""
+    check_members(env)
+    fresh = jax.eval_shape(env.reset, jax.random.key(0))
+    _check_fields(fresh)
+    _check_same("reset and step", _specs(fresh), _specs(_step_shapes(env, fresh)))
+
+
+def check_members(env: Env) -> None:
+    """Verifies that an environment has what every one has, of the right kind."""
+    for name in ("control_timestep", "action_size", "reset", "step"):
+        if not hasattr(env, name):
+            raise EnvError(
+                f"env.{name} is missing: an environment has control_timestep, "
+                "action_size, reset and step."
+            )
+    timestep = env.control_timestep
+    if not isinstance(timestep, int | float) or not 0 < timestep < float("inf"):
+        raise EnvError(
+            f"env.control_timestep is {timestep!r}: it must be a positive number of "
+            "seconds (a Python float)."
+        )
+    size = env.action_size
+    if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 1:
+        raise EnvError(f"env.action_size is {size!r}: it must be a positive int.")
+
+
+def _step_shapes(env: Env, fresh: State) -> Any:
+    """Returns the shapes that step makes of a state, by tracing it once."""
+    action = jax.ShapeDtypeStruct((env.action_size,), jnp.float32)
+    try:
+        return jax.eval_shape(env.step, fresh, action)
+    except Exception as error:
+        raise EnvError(
+            f"step cannot be traced with an action of env.action_size = {env.action_size} "
+            f"numbers, as jit needs: {error}"
+        ) from error
+
+
+def _check_fields(state: Any) -> None:
+    """The fields that every trainer reads, from the shapes of one fresh state."""
+    if not isinstance(state, State):
+        raise EnvError(f"reset returned a {type(state).__name__}: it must return env.State.")
+    rules = {"reward": jnp.float32, "terminated": jnp.bool_, "truncated": jnp.bool_}
+    scalars = {name: (getattr(state, name), dtype) for name, dtype in rules.items()}
+    if not isinstance(state.metrics, dict):
+        raise EnvError(f"metrics is a {type(state.metrics).__name__}: it must be a dict.")
+    for name, value in state.metrics.items():
+        scalars[f"metrics[{name!r}]"] = (value, jnp.float32)
+    for name, (value, dtype) in scalars.items():
+        if not hasattr(value, "dtype") or value.shape != () or value.dtype != dtype:
+            raise EnvError(
+                f"{name} is {_describe(value)}: it must be an array [] of {jnp.dtype(dtype).name}."
+            )
+    leaves = jax.tree_util.tree_leaves_with_path(state.observation)
+    if not leaves:
+        raise EnvError("observation is empty: it must hold at least one float32 array.")
+    for path, leaf in leaves:
+        if leaf.dtype != jnp.float32 or leaf.ndim == 0:
+            raise EnvError(
+                f"observation{jax.tree_util.keystr(path)} is {_describe(leaf)}: its "
+                "arrays must be float32 with at least one axis."
+            )
+
+
+def _describe(value: Any) -> str:
+    if not hasattr(value, "dtype"):
+        return f"a {type(value).__name__}"
+    weak = ", weakly typed" if getattr(value, "weak_type", False) else ""
+    return f"{value.dtype.name} {list(value.shape)}{weak}"
+
+
+def _specs(state: State) -> dict[str, str]:
+    """Returns path -> description of each leaf."""
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    return {jax.tree_util.keystr(path).lstrip("."): _describe(leaf) for path, leaf in leaves}
+
+
+def _check_same(what: str, first: dict[str, str], second: dict[str, str]) -> None:
+    """Shapes, dtypes and names must not depend on where a state came from, or scan fails."""
+    for name in sorted(first.keys() ^ second.keys()):
+        where = "reset only" if name in first else "step only"
+        raise EnvError(f"{name} is in the state of {where}: {what} must return the same fields.")
+    for name, spec in first.items():
+        if "weakly" in spec + second[name]:
+            raise EnvError(
+                f"{name} is weakly typed ({spec}; {second[name]}): give it a dtype, as "
+                "in jnp.float32(0) or jnp.zeros(())."
+            )
+        if spec != second[name]:
+            raise EnvError(
+                f"{name} is {spec} from reset and {second[name]} from step: {what} must "
+                "return the same shapes and dtypes."
+            )
+
+
+def _again(tree: PyTree) -> PyTree:
+    """Copies a tree for a second use of its keys, which JAX's key-reuse checking would refuse."""
+    return jax.tree.map(lambda x: jax.random.clone(x) if is_key(x) else x, tree)
+
+
+def _actions(num_steps: int, num_envs: int, size: int) -> Array:
+    """Returns actions [3 + T, B, A]: all -1, all 0, all 1, then random ones."""
+    corners = jnp.broadcast_to(jnp.array([-1.0, 0.0, 1.0])[:, None, None], (3, num_envs, size))
+    shape = (num_steps, num_envs, size)
+    noise = jax.random.uniform(jax.random.key(1), shape, minval=-1.0, maxval=1.0)
+    return jnp.concatenate([corners, noise])
+
+
+def _rollout(env: Env):
+    """Returns a jitted (state [B], actions [T, B, A]) -> (state [B], states [T, B])."""
+
+    def step(state, action):
+        state = jax.vmap(env.step)(state, action)
+        return state, state
+
+    return jax.jit(lambda state, actions: jax.lax.scan(step, state, actions))
+
+
+def _host_leaves(state: PyTree) -> dict[str, np.ndarray]:
+    """Returns path -> values of each leaf; keys as their raw bits."""
+    named = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(state):
+        value = jax.random.key_data(leaf) if is_key(leaf) else leaf
+        named[jax.tree_util.keystr(path).lstrip(".")] = np.asarray(value)
+    return named
+
+
+def _check_finite(when: str, state: PyTree) -> None:
+    for name, value in _host_leaves(state).items():
+        # A NaN fails the comparison.
+        if np.issubdtype(value.dtype, np.floating) and not (np.abs(value) <= ABSURD).all():
+            what = f"{np.abs(value).max():.3g}" if np.isfinite(value).all() else "not finite"
+            raise EnvError(
+                f"{name} is {what} after {when}: every number must be finite, and at most "
+                f"{ABSURD:.0e}, for any actions in [-1, 1], or the episode counts as lost."
+            )
+
+
+def _check_bits(what: str, first: PyTree, second: PyTree, rule: str) -> None:
+    other = _host_leaves(second)
+    for name, value in _host_leaves(first).items():
+        if value.tobytes() != other[name].tobytes():
+            raise EnvError(f"{name} differs between two calls with {what}: {rule}.")
+
+
+def _check_differs(state: State) -> None:
+    """Different keys must give different starts, or B environments are one."""
+    leaves = _host_leaves((state.physics, state.observation, state.task)).values()
+    if not any((leaf[0] != leaf[1]).any() for leaf in leaves):
+        raise EnvError(
+            "physics, observation and task are the same for different keys: reset must "
+            "draw something from its key, or all environments of a batch are one."
+        )

@@ -1,0 +1,34 @@
+"""Sizes that do not divide each other are told with sizes that do."""
+
+import pytest
+
+from purerl.devices.check_sizes import check_minibatches
+from purerl.ppo.config import Config
+
+
+def unfit(recurrent, **settings):
+    sizes = {"num_envs": 6, "rollout_length": 16, "num_minibatches": 3} | settings
+    config = Config(num_steps=6 * 16 * 100, **sizes)
+    with pytest.raises(ValueError) as error:
+        check_minibatches(config, recurrent, config.num_envs)
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("recurrent", "minibatches", "words"),
+    [
+        (False, 7, ("num_minibatches = 7", "num_envs * rollout_length = 96", "6, 8", "91 or 98")),
+        (True, 4, ("num_minibatches = 4", "num_envs = 6", "3", "4 or 8", "recurrent")),
+    ],
+)
+def test_minibatches_divide_the_rollout(recurrent, minibatches, words):
+    said = unfit(recurrent, num_minibatches=minibatches)
+    assert all(word in said for word in words)
+
+
+def test_segments_divide_rollouts_and_are_not_for_recurrent_networks():
+    said = unfit(False, segment_length=8, num_minibatches=16)
+    assert "num_envs * rollout_length / segment_length = 12" in said
+    assert "segment_length is 8, and the network is recurrent" in unfit(True, segment_length=8)
+    said = unfit(False, segment_length=5)
+    assert all(word in said for word in ("segment_length = 5", "rollout_length = 16", "4"))

@@ -1,0 +1,185 @@
+"""However a minibatch is cut into parts, a gradient step is the same up to rounding."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from purerl.core.parts import WHOLE, add_in_order, as_one_part
+from purerl.devices import multi_device, programs
+from purerl.devices.shards import Shards, parts_of
+from purerl.devices.slices import count_slices, cut_in_slices
+from purerl.ppo import algorithm, batches, learner, running_moments
+from purerl.ppo.config import Config, Evaluation
+from tests.ppo.test_algorithm import CONFIG, ROLLOUT, UPDATE, setup
+from tests.ppo.test_running_moments import update as merge_batch
+
+CUTS = {
+    "slices": (2, parts_of(Shards(), 2)),
+    "shards": (2, parts_of(Shards(2))),
+    "shards in slices": (4, parts_of(Shards(2), 2)),
+}
+
+
+def columns(recurrent, segment_length):
+    """All columns of a rollout in 12 environments, [T', C], and what made them."""
+    config = dataclasses.replace(CONFIG, segment_length=segment_length, num_envs=12)
+    env, network, state = setup(config, recurrent=recurrent)
+    memory = state.carry  # before the rollout
+    after, transitions, _, last_value = ROLLOUT(config, env, network, state)
+    batch = batches.make_batch(config, after, transitions, last_value, state.episode.length == 0)
+    return config, network, after, learner.arrange(config, recurrent, batch), memory
+
+
+def cut(number, axis, tree):
+    return jax.tree.map(lambda x: jnp.stack(jnp.split(x, number, axis)), tree)
+
+
+@pytest.mark.parametrize("name", CUTS)
+@pytest.mark.parametrize("recurrent, segment_length", [(False, 0), (True, 0), (False, 4)])
+def test_a_gradient_step_is_the_same_in_parts(name, recurrent, segment_length):
+    config, network, state, batch, memory = columns(recurrent, segment_length)
+    number, parts = CUTS[name]
+    begin = learner.Learner(
+        state.params, state.optimizer, state.learning_rate, state.skipped_in_a_row
+    )
+
+    def step(number, parts):
+        pieces, memories = cut(number, 1, batch), cut(number, 0, memory)
+        scale = None
+        if not segment_length:
+            size = pieces.weight.shape[2]
+            order = jnp.tile(jnp.arange(size), (number, 1, 1))  # one minibatch of all columns
+            scale = jax.tree.map(lambda x: x[0], learner.advantage_scales(pieces, order, parts))
+        return learner.minibatch_step(config, network, begin, pieces, memories, scale, parts)
+
+    whole, metrics = step(1, WHOLE)
+    found, others = step(number, parts)
+    assert metrics["gradient_norm"] > 1e-3 and metrics.keys() == others.keys()
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5),
+        (whole.params, metrics),
+        (found.params, others),
+    )
+
+
+def test_every_part_shuffles_its_own_columns_by_its_number():
+    key = jax.random.key(2)
+    order = np.asarray(learner.shuffle(key, jnp.array([0, 6]), 12, 3))
+    assert order.shape == (2, 3, 4)
+    assert all(set(part.ravel()) == set(range(12)) for part in order)
+    assert (order[0] != order[1]).any()
+    alone = learner.shuffle(key, jnp.array([6]), 12, 3)
+    np.testing.assert_array_equal(order[1:], alone)
+
+
+@pytest.mark.parametrize("name", CUTS)
+def test_advantages_of_a_minibatch_are_scaled_by_its_own(name):
+    number, parts = CUTS[name]
+    shape = (number, 1, 12)
+    advantage = jax.random.normal(jax.random.key(0), shape) * 3.0 + 1.0
+    weight = jax.random.bernoulli(jax.random.key(1), 0.8, shape).astype(jnp.float32)
+    batch = batches.Batch(*[advantage] * 8)._replace(weight=weight)
+    order = learner.shuffle(jax.random.key(2), jnp.arange(number), 12, 3)
+    found = learner.advantage_scales(batch, order, parts)
+    for k in range(3):
+        taken = [
+            np.asarray(x)[v, 0][np.asarray(order)[v, k]]
+            for x in (advantage, weight)
+            for v in range(number)
+        ]
+        values, counts = np.concatenate(taken[:number]), np.concatenate(taken[number:]) > 0
+        assert found.number[k] == counts.sum()
+        np.testing.assert_allclose(found.mean[k], values[counts].mean(), rtol=1e-4)
+        np.testing.assert_allclose(found.variance[k], values[counts].var(), rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "size, changes, recurrent, platform, number",
+    [
+        (512, {"rollout_length": 20, "num_minibatches": 1}, False, "gpu", 16),
+        (512, {"rollout_length": 20, "num_minibatches": 1}, False, "cpu", 1),
+        (64, {"rollout_length": 16, "num_minibatches": 1}, False, "gpu", 4),  # 256 samples each
+        (15, {"rollout_length": 17, "num_minibatches": 1}, False, "gpu", 1),
+        (64, {"rollout_length": 32, "num_minibatches": 1}, True, "gpu", 8),  # whole rollouts
+        (64, {"rollout_length": 320, "num_minibatches": 16}, True, "gpu", 4),  # 4 minibatches each
+        (64, {"rollout_length": 32, "segment_length": 16, "num_minibatches": 1}, False, "gpu", 8),
+    ],
+)
+def test_slices_are_equal_and_not_too_small(size, changes, recurrent, platform, number):
+    config = Config(num_steps=10**6, num_envs=size, **changes)
+    assert count_slices(config, size, recurrent, platform) == number
+
+
+def test_slices_hold_whole_environments():
+    env, network, state = setup()
+    experience = algorithm.collect(CONFIG, env, network, state)[1]
+    sliced = cut_in_slices(3, experience)
+    assert sliced.batch.weight.shape == (3, 16, 2) and sliced.number.tolist() == [
+        [0, 1], [2, 3], [4, 5],
+    ]  # fmt: skip
+    for i in range(3):
+        np.testing.assert_array_equal(
+            sliced.batch.raw_action[i], experience.batch.raw_action[0, :, 2 * i : 2 * i + 2]
+        )
+    assert sliced.sums is experience.sums
+
+
+@pytest.mark.parametrize("recurrent", [False, True])
+def test_on_a_gpu_an_update_is_two_programs_that_make_the_same(recurrent, monkeypatch):
+    env, network, state = setup(recurrent=recurrent)
+    expected, metrics = UPDATE(CONFIG, env, network, state)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    compiled = programs.compile_programs(
+        CONFIG, env, network, Evaluation(number=0), False, Shards()
+    )
+    assert set(compiled.seconds) == {"collect", "improve"}
+    updated, seen = compiled.update(jax.tree.map(jnp.copy, state))
+    leaves = jax.tree.leaves((seen, updated.params, updated.optimizer, updated.env.physics))
+    originals = jax.tree.leaves(
+        (metrics, expected.params, expected.optimizer, expected.env.physics)
+    )
+    for x, y in zip(leaves, originals, strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5)
+
+
+def test_on_a_gpu_minibatches_are_cut_in_slices(monkeypatch):
+    asked = []
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(multi_device, "count_slices", lambda *x: asked.append(x) or 2)
+    env, network, state = setup()
+    after, experience = algorithm.collect(CONFIG, env, network, state)
+    improve = partial(multi_device.improve, CONFIG, network, Shards())
+    _, metrics = improve(after, experience)
+    assert asked == [(CONFIG, 6, False, "gpu")]
+    assert metrics["skipped_minibatches"] == 0 and metrics["gradient_norm"] > 0
+
+
+def test_parts_add_in_one_order_whatever_their_number():
+    x = jax.random.normal(jax.random.key(0), (7, 3)) * 10.0 ** jnp.arange(7)[:, None]
+    a, b, c, d, e, f, g = np.asarray(x)
+    expected = ((a + d) + (c + f)) + ((b + e) + g)
+    np.testing.assert_allclose(add_in_order(x), expected, rtol=1e-6)
+    assert add_in_order(jnp.array([1e8, 1.0, -1e8, 1.0])) == 2.0  # (a + c) + (b + d)
+
+
+def test_pooled_moments_are_those_of_all_samples():
+    samples = jax.random.normal(jax.random.key(1), (4, 5, 2)) * 3.0 + 40.0
+    valid = jax.random.bernoulli(jax.random.key(2), 0.7, (4, 5)).at[1].set(False)
+    start = merge_batch(running_moments.init(jnp.zeros(2)), samples[0] + 1.0, jnp.ones(5, bool))
+    parts = jax.vmap(lambda x, v: running_moments.deviations(start, x, v))(samples, valid)
+    pooled = running_moments.merge(start, running_moments.pool(parts))
+    whole = merge_batch(start, samples.reshape(20, 2), valid.reshape(20))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), pooled, whole)
+    assert pooled.count.low == 5 + valid.sum()
+
+
+def test_one_part_is_the_plain_call():
+    tree = as_one_part({"x": jnp.arange(3.0)})
+    assert WHOLE.map(lambda t: t["x"].sum(), tree).tolist() == [3.0]
+    assert WHOLE.sum(lambda t: t["x"].sum(), tree) == 3.0
+    with pytest.raises(ValueError):
+        WHOLE.map(lambda x: x, jnp.zeros((2, 3)))  # two parts are not one
