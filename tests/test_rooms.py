@@ -1,107 +1,173 @@
-"""The library's arrows: who may import whom, and where effects may stand."""
+"""The house: which room may import which, what is pure, and how long the afternoon is."""
 
 import ast
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
-FILES = {path.stem: path for path in (ROOT / "purerl").glob("*.py")}
-# Effects live in these; whatever is not named here is pure, and imports nothing of these.
-EFFECTS = {
-    "building",
-    "checkpoint",
-    "cli",
-    "compare",
-    "compilation",
-    "console",
-    "disk",
-    "distributed",
-    "errors",
-    "evaluate",
-    "experiment",
-    "groups",
-    "history",
-    "kernels",
-    "launch",
-    "loggers",
-    "manifest",
-    "recorder",
-    "render",
-    "run",
-    "run_video",
-    "rundir",
-    "scene",
-    "seeds",
-    "spread",
-    "train",
-    "twins",
-    "video",
+import purerl
+
+HOUSE = Path(purerl.__file__).parent
+ROOT = HOUSE.parent
+# Room -> the rooms that it may import. The arrows point one way.
+MAY_IMPORT = {
+    "core": set(),
+    "exact": set(),
+    "ppo": {"core"},
+    "physics": {"core", "exact"},
+    "devices": {"core", "exact", "ppo"},
+    "runs": {"core", "exact", "ppo", "physics", "devices"},
+    "report": {"core", "ppo", "physics", "devices", "runs"},
 }
-PURE = sorted(set(FILES) - EFFECTS - {"__init__"})
-# The one host call above the line: MuJoCo's C code, a pure function of its arguments, on as many
-# threads as this process has cores; and how programs reach it.
-HOST_CALL = {"engine_c", "host_calls"}
+COMMANDS = {"compare", "evaluate", "record", "render", "run"}
+MODULES = {
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in HOUSE.rglob("*.py")
+}
+# Rooms without effects, but for these: MuJoCo's C code is called on threads of its own, which must
+# be a pure function of its arguments; and XLA reads its flags from the environment.
+PURE = ("core", "exact", "ppo", "physics")
+HOST_CALLS = {"purerl.physics.engine_c", "purerl.physics.host_calls"}
+XLA_FLAGS = "purerl.exact.xla_flags"
 FORBIDDEN_CALLS = {"print", "open", "input", "exec", "eval", "__import__"}
 FORBIDDEN_MODULES = {"time", "datetime", "os", "sys", "random", "subprocess", "logging", "pathlib"}
 CALLBACKS = {"pure_callback", "io_callback", "callback", "debug_callback", "ffi_call"}
+MACHINE = re.compile(r"shard|slice|device|platform|backend|engine", re.IGNORECASE)
 
 
-def imports(path):
-    """Every module imported anywhere in a file, dotted names in full."""
+def room_of(name):
+    parts = name.split(".")
+    return parts[1] if len(parts) > 1 and parts[1] in MAY_IMPORT else None
+
+
+def imported(path):
+    """Every module that a file's import statements name, wherever they stand."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
-        if isinstance(node, ast.ImportFrom):
+        if isinstance(node, ast.ImportFrom) and not node.level:
             yield node.module
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def own_imports(path):
-    """Names of the `purerl` modules that a file imports."""
-    parts = [name.split(".") for name in imports(path)]
-    return {p[1] for p in parts if p[0] == "purerl" and len(p) > 1 and p[1] in FILES}
+def own(path):
+    """The modules of purerl that a file imports."""
+    return {name for name in imported(path) if name in MODULES} - {"purerl"}
 
 
-def test_every_module_is_on_one_side():
-    assert {"ppo", "rollout", "physics", "env"} <= set(PURE)
-    assert not EFFECTS - set(FILES), "a listed module is gone"
+def stands_on(names):
+    """These modules and all of purerl that they import."""
+    todo, found = [*names, "purerl.core"], set()
+    while todo:
+        name = todo.pop()
+        if name not in found:
+            found.add(name)
+            todo += own(MODULES[name])
+    return found
 
 
-@pytest.mark.parametrize("name", sorted(FILES))
-def test_library_imports_no_environment_and_no_experiment(name):
-    assert not {m.split(".")[0] for m in imports(FILES[name])} & {"envs", "experiments", "tests"}
+def test_nothing_but_rooms_and_commands():
+    beside = {path.stem for path in HOUSE.glob("*.py")}
+    assert beside == COMMANDS | {"__init__", "__main__"}
+    folders = {path.name for path in HOUSE.iterdir() if path.is_dir()} - {"__pycache__"}
+    assert folders == set(MAY_IMPORT) and len(folders) <= 7
 
 
-@pytest.mark.parametrize("name", PURE)
-def test_pure_modules_import_no_effects(name):
-    assert not own_imports(FILES[name]) & EFFECTS
+@pytest.mark.parametrize("room", MAY_IMPORT)
+def test_a_room_imports_only_those_below(room):
+    for name, path in MODULES.items():
+        if room_of(name) == room:
+            found = {room_of(other) for other in own(path)} - {room}
+            assert found <= MAY_IMPORT[room], f"{name} imports {found - MAY_IMPORT[room]}"
+            assert not {n for n in own(path) if n.count(".") == 1 and n.split(".")[1] in COMMANDS}
 
 
-@pytest.mark.parametrize("name", PURE)
-def test_pure_modules_have_no_effects(name):
-    path = FILES[name]
-    found = set(imports(path)) - ({"os"} if name in HOST_CALL else set())
-    assert not {m.split(".")[0] for m in found} & FORBIDDEN_MODULES
+@pytest.mark.parametrize("room", MAY_IMPORT)
+def test_a_room_says_what_belongs_there(room):
+    said = ast.get_docstring(ast.parse((HOUSE / room / "__init__.py").read_text()))
+    (names,) = re.findall(r"May import: ([^.]*)\.", said)
+    names = set(re.findall(r"\w+", names)) - {"nothing"}
+    assert names == MAY_IMPORT[room], "the docstring and the table must agree"
+    assert re.search(r"\bRead:? ", said), "where a reader starts"
+
+
+def test_no_circles():
+    done, path = set(), []
+
+    def visit(name):
+        assert name not in path, f"a circle: {' -> '.join([*path[path.index(name) :], name])}"
+        if name in done:
+            return
+        path.append(name)
+        for other in own(MODULES[name]):
+            visit(other)
+        done.add(path.pop())
+
+    for name in MODULES:
+        visit(name)
+
+
+def test_the_library_imports_no_environment_and_no_experiment():
+    for name, path in MODULES.items():
+        roots = {other.split(".")[0] for other in imported(path)}
+        assert not roots & {"envs", "experiments", "tests"}, name
+
+
+@pytest.mark.parametrize("name", [n for n in MODULES if room_of(n) in PURE])
+def test_pure_rooms_have_no_effects(name):
+    path = MODULES[name]
+    found = {module.split(".")[0] for module in imported(path)} & FORBIDDEN_MODULES
+    assert found <= ({"os"} if name in HOST_CALLS | {XLA_FLAGS} else set())
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Attribute) and getattr(node.value, "id", "") == "os":
-            assert node.attr == "sched_getaffinity", f"line {node.lineno}"
+            allowed = "environ" if name == XLA_FLAGS else "sched_getaffinity"
+            assert node.attr == allowed, f"line {node.lineno}"
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
             assert node.func.id not in FORBIDDEN_CALLS, f"line {node.lineno}"
-        if isinstance(node, ast.Attribute) and name not in HOST_CALL:
+        if isinstance(node, ast.Attribute) and name not in HOST_CALLS:
             assert node.attr not in CALLBACKS, f"line {node.lineno}"
 
 
-@pytest.mark.parametrize("folder", ["envs", "experiments"])
-def test_environments_import_only_the_pure_side_and_experiments(folder):
-    allowed = set(PURE) | ({"experiment"} if folder == "experiments" else set())
-    for path in (ROOT / folder).rglob("*.py"):
-        # A script beside the experiments is a command of its own, and may import commands.
-        if "def main(" not in path.read_text():
-            assert own_imports(path) <= allowed, path
+# --- the afternoon ---
+
+ALGORITHM = stands_on([name for name in MODULES if room_of(name) == "ppo"])
 
 
-def test_ppo_imports_no_network_library():
-    for name in ("ppo", "rollout", "evaluation", "losses", "gae"):
-        linked = {m for m in imports(FILES[name]) if m.startswith("flax")}
+def test_the_algorithm_can_be_read_in_an_afternoon():
+    lines = {name: len(MODULES[name].read_text().splitlines()) for name in ALGORITHM}
+    assert sum(lines.values()) <= 1800
+    assert max(lines.values()) <= 260
+    assert {room_of(name) for name in ALGORITHM} == {"ppo", "core"}
+
+
+@pytest.mark.parametrize("name", sorted(ALGORITHM))
+def test_the_algorithm_knows_nothing_of_the_machine(name):
+    found = [line for line in MODULES[name].read_text().splitlines() if MACHINE.search(line)]
+    assert not found
+
+
+def test_only_networks_import_a_network_library():
+    for name in ALGORITHM - {"purerl.ppo.networks"}:
+        linked = {m for m in imported(MODULES[name]) if m.startswith("flax")}
         assert linked <= {"flax", "flax.struct"}, name
+
+
+def test_no_file_is_long():
+    lines = {name: len(path.read_text().splitlines()) for name, path in MODULES.items()}
+    assert sum(lines.values()) < 10_318  # when it was one folder
+    assert not {name: n for name, n in lines.items() if n > 305}
+
+
+# --- what starts at once ---
+
+
+@pytest.mark.parametrize(
+    "words", ["import purerl", "import purerl.compare", "import purerl.run", "import purerl.exact"]
+)
+def test_it_starts_without_jax(words):
+    code = f"{words}; import sys; print('jax' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.stdout == "False\n", done.stderr

@@ -2,8 +2,8 @@
 
 A part has its own environments and an equal share of every minibatch. The algorithm says what is
 computed of each part and what is added up over all of them. It does not know how many there are,
-nor where they are computed: that is in the record `Parts`. Here is the simplest one, `WHOLE`;
-`purerl.devices` has the others.
+nor where they are computed: that is in the record `Parts`. Here is the simplest one, `WHOLE`. The
+others are written where the machine is known.
 """
 
 from collections.abc import Callable

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from purerl.core.records import PyTree
-    from purerl.ppo.config import Config
 
 # What a setting must be, how that is told, and the names of those that must be so.
 TRAINING = (
@@ -30,7 +29,7 @@ def check_rules(settings: Any, rules: tuple) -> None:
                 raise ValueError(f"{name} is {getattr(settings, name)}; it must be {rule}.")
 
 
-def check_budget(config: "Config") -> None:
+def check_budget(config: Any) -> None:
     """Checks that the run has at least one update."""
     if config.num_updates < 1:
         raise ValueError(

@@ -1,7 +1,4 @@
-"""The learner: E epochs of K minibatch steps on what an update has collected.
-
-Clipped surrogate and value loss of Schulman et al. 2017 (arXiv:1707.06347).
-"""
+"""The learner: E epochs of K minibatch steps on what an update has collected (PPO, section 5)."""
 
 import functools
 from typing import NamedTuple
