@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 
 import jax
 
+from purerl import exact
 from purerl.core.env import Env
 from purerl.core.records import Array, Metrics, Network, PyTree, TrainState
-from purerl.exact.rewrite import list_scatter_sums
 from purerl.ppo import algorithm
 from purerl.ppo.config import Config
 from purerl.ppo.evaluation import evaluate_in_run
@@ -195,4 +195,4 @@ def when_needed(
 
 def unordered(traced: Any) -> list[str]:
     """Lists the sums of a traced program whose order nothing fixes on a GPU."""
-    return sorted({f"{s.primitive} at {s.source}" for s in list_scatter_sums(traced.jaxpr)})
+    return sorted({f"{s.primitive} at {s.source}" for s in exact.unordered_in(traced.jaxpr)})

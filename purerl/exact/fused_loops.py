@@ -19,13 +19,11 @@ from typing import Any, NamedTuple, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax import Array, lax
 from jax.extend import core
 
-from purerl.core.records import Array
 from purerl.exact import pallas_calls
-from purerl.exact.constants import CALLS, called_jaxpr
-from purerl.exact.traced_loops import equations, sub_jaxprs
+from purerl.exact.traces import CALLS, called_jaxpr, equations, evaluate, sub_jaxprs
 
 SHORT = 4  # entries of any other axis, at most
 LONGEST = 512  # of the long one: 16 registers of each thread for a vector
@@ -42,7 +40,7 @@ class Long(NamedTuple):
 
 def wanted(eqn: core.JaxprEqn) -> bool:
     """Tells whether an equation is a loop to be computed by one kernel."""
-    if eqn.primitive.name != "scan" or not pallas_calls.can_run():
+    if eqn.primitive.name != "scan":
         return False
     body = eqn.params["jaxpr"]
     carries_all = [v.aval for v in body.jaxpr.outvars] == [v.aval for v in eqn.outvars]
@@ -83,15 +81,15 @@ def _has_rule(eqn: core.JaxprEqn) -> bool:
     return known and (short or name not in _OF_SHORT_AXES)
 
 
-def compute(eqn: core.JaxprEqn, inputs: Sequence[Array]) -> list[Array]:
-    """Computes a loop that is `wanted`."""
+def compute(eqn: core.JaxprEqn, platform: str, *inputs: Array) -> list[Array]:
+    """Computes a loop that is `wanted`, by a kernel for a platform."""
     body = eqn.params["jaxpr"]
     size = _long_size(body)
     assert size is not None, "not wanted"
     kernel = functools.partial(_kernel, body, eqn.params["length"], size)
     results = [jax.ShapeDtypeStruct(a.shape, _kept(a.dtype)) for a in body.out_avals]
-    pairs = zip(inputs, body.in_avals, strict=True)
-    found = pallas_calls.call(kernel, results, *(jnp.asarray(x, _kept(a.dtype)) for x, a in pairs))
+    given = [jnp.asarray(x, _kept(a.dtype)) for x, a in zip(inputs, body.in_avals, strict=True)]
+    found = pallas_calls.call(kernel, results, *given, platform=platform)
     return [x.astype(a.dtype) for x, a in zip(found, body.out_avals, strict=True)]
 
 
@@ -176,18 +174,11 @@ def _store(long: Long, ref: Any, value: Value) -> None:
 
 def _evaluate(long: Long, closed: core.ClosedJaxpr, *args: Value) -> list[Value]:
     """Runs a trace."""
-    values: dict[Any, Value] = {}
 
-    def read(atom: Any) -> Value:
-        return values[atom] if isinstance(atom, core.Var) else _constant(atom.val, atom.aval.dtype)
+    def apply(eqn: core.JaxprEqn, *inputs: Value) -> list[Value]:
+        return _RULES[eqn.primitive.name](long, eqn, *inputs)
 
-    consts = [_constant(x, jnp.result_type(x)) for x in closed.consts]
-    values.update(zip(closed.jaxpr.constvars, consts, strict=True))
-    values.update(zip(closed.jaxpr.invars, args, strict=True))
-    for eqn in closed.jaxpr.eqns:
-        outputs = _RULES[eqn.primitive.name](long, eqn, *map(read, eqn.invars))
-        values.update(zip(eqn.outvars, outputs, strict=True))
-    return [read(v) for v in closed.jaxpr.outvars]
+    return evaluate(closed, apply, _constant, *args)
 
 
 def _constant(x: Any, dtype: Any) -> Value:

@@ -15,10 +15,9 @@ from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
-from jax import lax
+from jax import Array, lax
 from jax.extend import core
 
-from purerl.core.records import Array
 from purerl.exact import pallas_calls
 
 # Rows: a warp has registers for no more. A factor and two solves of 4,096 systems, here and by the
@@ -29,7 +28,7 @@ LARGEST = 32
 def wanted(eqn: core.JaxprEqn) -> bool:
     """Tells whether an equation is a factorisation or a solve to be computed by these kernels."""
     name = eqn.primitive.name
-    if name not in ("cholesky", "triangular_solve") or not pallas_calls.can_run():
+    if name not in ("cholesky", "triangular_solve"):
         return False
     matrix, *sides = [cast(Any, v.aval) for v in eqn.invars]
     small = matrix.ndim == 2 and 0 < matrix.shape[0] <= LARGEST and matrix.dtype == jnp.float32
@@ -39,41 +38,53 @@ def wanted(eqn: core.JaxprEqn) -> bool:
     return small and plain and sides[0].shape[1] == 1
 
 
-def compute(eqn: core.JaxprEqn, inputs: list[Array]) -> list[Array]:
-    """Computes an equation that is `wanted`."""
+def compute(eqn: core.JaxprEqn, platform: str, *inputs: Array) -> list[Array]:
+    """Computes an equation that is `wanted`, by a kernel for a platform."""
     if eqn.primitive.name == "cholesky":
-        return [cholesky(*inputs)]
+        return [cholesky(*inputs, platform=platform)]
     (matrix, side), p = inputs, eqn.params  # conjugate_a changes nothing of real numbers
-    found = triangular_solve(matrix, side[:, 0], lower=p["lower"], transposed=p["transpose_a"])
-    return [found[:, None]]
+    halves = {"lower": p["lower"], "transposed": p["transpose_a"]}
+    return [triangular_solve(matrix, side[:, 0], **halves, platform=platform)[:, None]]
 
 
-def cholesky(matrix: Array) -> Array:
-    """Returns the lower L [n, n] with L L^T = `matrix` [n, n], of which the lower half is read.
-
-    Where it is not positive definite, L is NaN from the first bad pivot on.
-    """
-    return _call(_cholesky_kernel, matrix.shape, matrix)
-
-
-def triangular_solve(matrix: Array, side: Array, *, lower: bool, transposed: bool) -> Array:
-    """Returns x [n] with T x = `side` [n], T the `matrix` [n, n] or its transpose.
+def cholesky(matrix: Array, *, platform: str | None = None) -> Array:
+    """Factorises a symmetric matrix.
 
     Args:
-      matrix: of which only one half is read.
-      side: the right-hand side.
-      lower: which half.
+      matrix: [n, n], of which only the lower half is read.
+      platform: the platform to run on.
+
+    Returns:
+      The lower L [n, n] with L L^T = `matrix`. If the matrix is not positive definite, L is NaN
+      from the first bad pivot on.
+    """
+    return _call(_cholesky_kernel, matrix.shape, matrix, platform=platform)
+
+
+def triangular_solve(
+    matrix: Array, side: Array, *, lower: bool, transposed: bool, platform: str | None = None
+) -> Array:
+    """Solves T x = `side`, where T is a triangular matrix or its transpose.
+
+    Args:
+      matrix: [n, n], of which only one half is read.
+      side: [n], the right-hand side.
+      lower: whether that half is the lower one.
       transposed: whether T is the transpose.
+      platform: the platform to run on.
+
+    Returns:
+      x, [n].
     """
     kernel = functools.partial(_solve_kernel, lower, transposed)
-    return _call(kernel, side.shape, matrix, side)
+    return _call(kernel, side.shape, matrix, side, platform=platform)
 
 
-def _call(kernel: Callable, shape: tuple[int, ...], *inputs: Array) -> Array:
-    """Runs a kernel on one system; it is told m."""
+def _call(kernel: Callable, shape: tuple[int, ...], *inputs: Array, platform: str | None) -> Array:
+    """Runs a kernel, which is told m, on one system."""
     m = max(4, 1 << (shape[0] - 1).bit_length())
     result = jax.ShapeDtypeStruct(shape, jnp.float32)
-    return pallas_calls.call(functools.partial(kernel, m), [result], *inputs)[0]
+    return pallas_calls.call(functools.partial(kernel, m), [result], *inputs, platform=platform)[0]
 
 
 def _places(m: int) -> tuple[Array, Array]:

@@ -2,11 +2,11 @@
 
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax import Array, lax
 from jax.extend import core
 
-from purerl.core.records import Array
 from purerl.exact.constants import Known
+from purerl.exact.traces import source
 
 _FEW_TERMS = 4
 
@@ -130,11 +130,3 @@ def _order_of_sums(address: np.ndarray, none: int) -> tuple[np.ndarray, np.ndarr
     turn = np.arange(len(order)) - np.repeat(start, count)
     turns[turn, np.repeat(np.arange(len(touched)), count)] = order
     return touched, turns
-
-
-def source(eqn: core.JaxprEqn) -> str:
-    """Returns the file and line that traced an equation, outside of JAX itself."""
-    traceback = eqn.source_info.traceback
-    frames = traceback.frames if traceback else []
-    own = [f for f in frames if "/jax/_src/" not in f.file_name] or frames
-    return f"{own[0].file_name}:{own[0].line_num}" if own else "an unknown line"

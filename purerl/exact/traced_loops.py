@@ -1,12 +1,12 @@
 """What a trace tells of a loop before it runs."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import jax.numpy as jnp
 from jax.extend import core
 
 from purerl.exact.constants import Known
+from purerl.exact.traces import equations
 
 # A scan makes all its rounds. Beyond so many, the loop most likely ends far earlier: MuJoCo's
 # default is 100 iterations, of which a cartpole needs two.
@@ -22,26 +22,6 @@ FEW_EQUATIONS = 1000
 # one thread adds the 108 of a column; of [3, 108] a warp does, for all columns in one kernel.
 MANY_ROWS = 32
 FEW_COLUMNS = 4
-
-
-def sub_jaxprs(eqn: core.JaxprEqn) -> list[core.ClosedJaxpr]:
-    """Returns the traces inside one equation (loop bodies, branches, called functions)."""
-    found = []
-    for value in eqn.params.values():
-        for item in value if isinstance(value, tuple | list) else (value,):
-            if isinstance(item, core.ClosedJaxpr):
-                found.append(item)
-            elif isinstance(item, core.Jaxpr):
-                found.append(core.ClosedJaxpr(item, ()))
-    return found
-
-
-def equations(closed: core.ClosedJaxpr) -> Iterator[core.JaxprEqn]:
-    """Yields all equations of a trace, at any depth, each before those inside of it."""
-    for eqn in closed.jaxpr.eqns:
-        yield eqn
-        for sub in sub_jaxprs(eqn):
-            yield from equations(sub)
 
 
 def has_loop(closed: core.ClosedJaxpr) -> bool:

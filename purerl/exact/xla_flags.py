@@ -38,7 +38,7 @@ FIXING_FLAGS = (
 KEPT_TIMINGS = "JAX_PERSISTENT_CACHE_ENABLE_XLA_CACHES"
 
 
-def set_flags() -> None:
+def set_xla_flags() -> None:
     """Sets what XLA_FLAGS does not; to be called before JAX starts.
 
     Where it says anything of timing, that holds, and none of the `RULES` does.

@@ -19,7 +19,7 @@ from purerl.runs import checkpoint
 from purerl.devices import compilation
 from purerl.runs import console
 from purerl.devices import processes
-from purerl.exact import xla_flags
+from purerl import exact
 from purerl.runs import manifest
 from purerl.ppo import algorithm
 from purerl.runs import run_folder
@@ -112,7 +112,7 @@ def describe_process(
 ) -> dict[str, Any]:
     """Returns what the bits depend on besides the settings, as the manifest keeps it."""
     builders = (chosen.build_env, chosen.build_network)
-    chosen_by = xla_flags.how_chosen(jax.default_backend())
+    chosen_by = exact.how_chosen(jax.default_backend())
     facts = manifest.collect(setup.engine, builders, chosen_by, shards.number)
     facts["model"] = build_experiment.physics_hash(setup.env)
     if vmapped > 1:
