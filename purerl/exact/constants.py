@@ -1,7 +1,7 @@
-"""Values of a trace that are known before it runs: integers and truth values made of constants.
+"""Values of a trace that are known before it runs: integers and booleans computed from constants.
 
 MJX computes its indices from constants with JAX operations, tens of thousands of them in a large
-model. Here they are computed once, with numpy: JAX would compile a small program for each shape.
+model. Here numpy computes them, once: JAX would compile a small program for each shape.
 """
 
 import contextlib
@@ -20,10 +20,10 @@ Known = Callable[[], np.ndarray] | None  # gives a value known while tracing
 
 
 def known_constant(const: Any) -> Known:
-    """A constant of the trace is known unless it is itself being traced."""
+    """Gives the value of a constant of a trace, unless that is itself being traced."""
     if isinstance(const, jax.core.Tracer) or not hasattr(const, "dtype"):
         return None
-    # Only indices matter here: keys and floating-point tables need never be fetched.
+    # Only indices matter: keys and floating-point tables need not be fetched from the device.
     return functools.partial(np.asarray, const) if _is_integral(const.dtype) else None
 
 
@@ -68,7 +68,7 @@ def _is_integral(dtype: Any) -> bool:
 
 
 def on_cpu() -> contextlib.AbstractContextManager:
-    """Computes on the CPU what is computed at once: a GPU's compiler takes its time over each."""
+    """Makes JAX compute on the CPU: a GPU's compiler takes long over each single operation."""
     try:
         return jax.default_device(jax.local_devices(backend="cpu")[0])
     except RuntimeError:  # JAX_PLATFORMS leaves the CPU out
@@ -115,7 +115,7 @@ def _cumulative_sum(p: dict, x: np.ndarray) -> np.ndarray:
 
 
 def _remainder(p: dict, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    # As XLA has it: the sign of the dividend; x for y = 0.
+    # As in XLA: the result has the sign of the dividend, and is x for y = 0.
     return np.where(y == 0, x, np.fmod(x, np.where(y == 0, 1, y)))
 
 
@@ -124,26 +124,15 @@ def _select(p: dict, which: np.ndarray, *cases: np.ndarray) -> np.ndarray:
 
 
 # Integer arithmetic wraps around in numpy as in XLA.
+_ELEMENTWISE = {
+    "add": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative, "sign": np.sign,
+    "max": np.maximum, "min": np.minimum, "lt": np.less, "le": np.less_equal, "gt": np.greater,
+    "ge": np.greater_equal, "eq": np.equal, "ne": np.not_equal,
+    "and": np.bitwise_and, "or": np.bitwise_or, "not": np.invert,
+}  # fmt: skip
 _RULES: dict[str, Callable[..., np.ndarray]] = {
     name: functools.partial(lambda f, p, *values: f(*values), function)
-    for name, function in {
-        "add": np.add,
-        "sub": np.subtract,
-        "mul": np.multiply,
-        "neg": np.negative,
-        "max": np.maximum,
-        "min": np.minimum,
-        "lt": np.less,
-        "le": np.less_equal,
-        "gt": np.greater,
-        "ge": np.greater_equal,
-        "eq": np.equal,
-        "ne": np.not_equal,
-        "and": np.bitwise_and,
-        "or": np.bitwise_or,
-        "not": np.invert,
-        "sign": np.sign,
-    }.items()
+    for name, function in _ELEMENTWISE.items()
 }
 _RULES |= {"broadcast_in_dim": _broadcast, "slice": _slice, "rem": _remainder, "select_n": _select}
 _RULES |= {"iota": _iota, "cumsum": _cumulative_sum}

@@ -20,11 +20,10 @@ from jax import lax
 from jax.extend import core
 
 from purerl.exact import fused_loops, fused_solves, pallas_calls, walk
-from purerl.exact.constants import Known
 from purerl.exact.scatters import gathered_scatter, puts
 from purerl.exact.traced_loops import MOST_ROUNDS, WRITTEN_OUT, is_tall, is_written_out, rounds
 from purerl.exact.traces import with_own_derivative
-from purerl.exact.walk import Inside, Rule
+from purerl.exact.walk import Rule
 
 
 def rules(platform: str) -> list[Rule]:
@@ -38,7 +37,7 @@ def rules(platform: str) -> list[Rule]:
 
 
 def _kernel(module: ModuleType, platform: str) -> Rule:
-    """Returns the rule that computes by a module's kernel whatever the module wants.
+    """Returns the rule that runs a module's kernel in the place of what the module wants.
 
     The kernels have no derivative; that of the replaced equation is taken.
     """
@@ -51,18 +50,14 @@ def _kernel(module: ModuleType, platform: str) -> Rule:
     return Rule(module.wanted, replace)
 
 
-def _gather_of_put(
-    eqn: core.JaxprEqn, inputs: list, known: list[Known], inside: Inside
-) -> list | None:
+def _gather_of_put(eqn, inputs, known, inside) -> list | None:
     if not puts(eqn) or known[1] is None:
         return None
     return [gathered_scatter(eqn, inputs, known)]
 
 
-def _short_scan(
-    eqn: core.JaxprEqn, inputs: list, known: list[Known], inside: Inside
-) -> list | None:
-    """A scan with some rounds written out if it is short, and tall constants transposed."""
+def _short_scan(eqn, inputs, known, inside) -> list | None:
+    """Computes a scan with rounds written out if it is short, and tall constants transposed."""
     if eqn.primitive.name != "scan":
         return None
     params = eqn.params
@@ -84,10 +79,8 @@ def _is_while(eqn: core.JaxprEqn) -> bool:
     return eqn.primitive.name == "while"
 
 
-def _scan_of_while(
-    eqn: core.JaxprEqn, inputs: list, known: list[Known], inside: Inside
-) -> list | None:
-    """A scan in the place of a `while` that makes few rounds at most."""
+def _scan_of_while(eqn, inputs, known, inside) -> list | None:
+    """Computes a `while` that makes few rounds at most by a scan."""
     limit = rounds(eqn.params, known) if _is_while(eqn) else None
     if limit is None or limit > MOST_ROUNDS:
         return None

@@ -1,12 +1,12 @@
 """Cholesky factors and triangular solves of small matrices on a GPU, each as one kernel.
 
 MJX factorises a matrix [nv, nv] for each environment and solves with it, several times in a physics
-step. JAX hands that to cuSOLVER and cuBLAS: four launches each, for pointers and flags, outside of
-CUDA graphs. Of an ant's physics step of 0.50 ms they were 0.19. These kernels, written in Pallas,
-take a matrix for each warp, which keeps it in registers (measured: `docs/gpu.md`).
+step. JAX calls cuSOLVER and cuBLAS for that. Each call makes four launches, outside of CUDA graphs;
+of an ant's physics step of 0.50 ms they took 0.19. In these kernels, written in Pallas, each warp
+takes one matrix and keeps it in registers (measured: `docs/gpu.md`).
 
-A warp works on [m, m], m the next power of 2 from 4 on, of a matrix [n, n]; beyond n it reads an
-identity.
+Of a matrix [n, n] a warp works on [m, m], where m is the least power of 2 that is not below n, and
+at least 4. Beyond n it reads an identity.
 """
 
 import functools
@@ -48,15 +48,9 @@ def compute(eqn: core.JaxprEqn, platform: str, *inputs: Array) -> list[Array]:
 
 
 def cholesky(matrix: Array, *, platform: str | None = None) -> Array:
-    """Factorises a symmetric matrix.
+    """Returns the lower L [n, n] with L L^T = `matrix` [n, n], of which the lower half is read.
 
-    Args:
-      matrix: [n, n], of which only the lower half is read.
-      platform: the platform to run on.
-
-    Returns:
-      The lower L [n, n] with L L^T = `matrix`. If the matrix is not positive definite, L is NaN
-      from the first bad pivot on.
+    If the matrix is not positive definite, L is NaN from the first bad pivot on.
     """
     return _call(_cholesky_kernel, matrix.shape, matrix, platform=platform)
 

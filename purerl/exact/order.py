@@ -13,10 +13,9 @@ import jax
 import jax.numpy as jnp
 from jax.extend import core
 
-from purerl.exact.constants import Known
 from purerl.exact.scatters import ordered_scatter
 from purerl.exact.traces import equations, source
-from purerl.exact.walk import Inside, Rule
+from purerl.exact.walk import Rule
 
 _SUMS = ("scatter-add", "scatter_add", "scatter-mul", "scatter_mul", "scatter-sub", "scatter_sub")
 
@@ -60,7 +59,7 @@ def is_unordered(eqn: core.JaxprEqn) -> bool:
     return sums and jnp.issubdtype(eqn.invars[0].aval.dtype, jnp.inexact)
 
 
-def _in_order(eqn: core.JaxprEqn, inputs: list, known: list[Known], inside: Inside) -> list | None:
+def _in_order(eqn, inputs, known, inside) -> list | None:
     return [ordered_scatter(eqn, inputs, known)] if is_unordered(eqn) else None
 
 

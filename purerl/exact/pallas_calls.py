@@ -40,16 +40,16 @@ def call(
     grid: tuple[int, ...] = (),
     platform: str | None = None,
 ) -> list[Array]:
-    """Runs a kernel in one warp, or in a `grid` of them; vmapped, in so many for each.
+    """Runs a kernel in one warp, or in a `grid` of warps; under `vmap`, in as many for each.
 
     Args:
       kernel: takes a reference to each input, then to each result, and writes the results.
       results: their shapes and dtypes.
       *inputs: the arrays to read.
       grid: number of warps along each axis; `pallas.program_id` tells a kernel which it is.
-      platform: the platform to run on; beside a GPU, the kernel is interpreted.
+      platform: the platform to run on; only a GPU runs the kernel, others interpret it.
     """
-    # Imported here: it takes 0.1 s, of which a run on CPUs need not wait.
+    # Imported here: it takes 0.1 s, and a run on CPUs need not wait for it.
     from jax.experimental import pallas
     from jax.experimental.pallas import triton
 
@@ -63,7 +63,7 @@ def call(
 
 
 def copy(rows: list[Array]) -> list[Array]:
-    """Returns arrays [n] as they are, copied by kernels of which XLA does not know what they do."""
+    """Returns arrays [n] unchanged, copied by kernels whose work XLA does not know."""
     copied: list[Array] = []
     for some in (rows[i : i + AT_ONCE] for i in range(0, len(rows), AT_ONCE)):
         results = [jax.ShapeDtypeStruct(row.shape, row.dtype) for row in some]

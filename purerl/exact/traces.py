@@ -51,25 +51,13 @@ def source(eqn: core.JaxprEqn) -> str:
 
 def bind_equation(eqn: core.JaxprEqn, *inputs: Any) -> list:
     """Runs one equation as it is."""
-    params = eqn.primitive.get_bind_params(eqn.params)
-    # jax before 0.10 returned the called functions apart.
-    called, params = params if isinstance(params, tuple) else ((), params)
     with eqn.ctx.manager:
-        outputs = eqn.primitive.bind(*called, *inputs, **params)
+        outputs = eqn.primitive.bind(*inputs, **eqn.primitive.get_bind_params(eqn.params))
     return list(outputs) if eqn.primitive.multiple_results else [outputs]
 
 
 def with_own_derivative(eqn: core.JaxprEqn, compute: Callable, inputs: Sequence[Any]) -> list:
-    """Runs `compute` in the place of an equation, and differentiates the equation itself.
-
-    Args:
-      eqn: the equation.
-      compute: takes its inputs and returns a list of its outputs, up to rounding.
-      inputs: the arrays to compute with.
-
-    Returns:
-      The outputs of `compute`; those of the equation when they are being differentiated.
-    """
+    """Returns `compute(*inputs)`, or the equation itself when that is being differentiated."""
     computed = jax.custom_jvp(compute)
     computed.defjvp(functools.partial(jax.jvp, functools.partial(bind_equation, eqn)))
     return computed(*inputs)
@@ -82,8 +70,8 @@ def evaluate(
 
     Args:
       closed: the trace.
-      apply: takes an equation and its inputs and returns its outputs.
-      constant: makes such a value of an array and a dtype.
+      apply: (equation, *inputs) -> outputs.
+      constant: (array, dtype) -> the value that stands for it.
       *args: the arguments.
     """
     values: dict[Any, Any] = {}
