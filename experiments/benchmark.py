@@ -30,10 +30,9 @@ import jax
 import jax.numpy as jnp
 
 from experiments import start_up
-from purerl import run
+from purerl import exact, run
 from purerl.core.errors import leave, output_file
 from purerl.core.records import Array, Network, PyTree, TrainState
-from purerl.exact import xla_flags
 from purerl.physics.lookup import scale_action
 from purerl.ppo import algorithm, learner
 from purerl.ppo.evaluation import evaluate
@@ -237,7 +236,7 @@ def main(arguments: list[str]) -> int:
     options, overrides = parser.parse_known_args(arguments)
     if options.start_up:
         return start_up.main([options.experiment, *overrides])
-    xla_flags.set_flags()  # as a run does, before JAX starts
+    exact.set_xla_flags()  # as a run does, before JAX starts
     prog = f"python -m experiments.benchmark {options.experiment}"
     experiment, _ = run.from_command_line(
         command_line.parse, find(options.experiment), overrides, prog

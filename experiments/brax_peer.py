@@ -36,10 +36,10 @@ from envs import brax_env
 from experiments import brax_network
 from experiments.benchmark import Part, measure
 from experiments.peers import Ours
+from purerl import exact
 from purerl.core.errors import leave, output_file
 from purerl.core.records import Array, PyTree
 from purerl.devices import compilation
-from purerl.exact import xla_flags
 from purerl.ppo.config import Config, Evaluation
 from purerl.runs import build_experiment
 from purerl.runs.experiment import Experiment
@@ -271,7 +271,7 @@ def main(arguments: list[str]) -> int:
     if options.stretches < 3:
         parser.error(f"--stretches is {options.stretches}; two compile, so it takes at least 3.")
     if "purerl" in options.trainers:
-        xla_flags.set_flags()  # before JAX starts; it holds for all in this process
+        exact.set_xla_flags()  # before JAX starts; it holds for all in this process
     found: dict[str, list[dict]] = {}
     for body in options.bodies:
         sizes, rates = resize(BODIES[body], options.num_envs), []

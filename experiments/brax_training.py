@@ -29,10 +29,10 @@ import jax
 import numpy as np
 
 from experiments.brax_peer import BODIES, Published, our_experiment, resize, train_brax
+from purerl import exact
 from purerl.core.errors import UserError, leave, output_file
 from purerl.devices import compilation
 from purerl.devices.compilation import Programs
-from purerl.exact import xla_flags
 from purerl.ppo.config import Evaluation
 from purerl.report import bootstrap
 from purerl.runs import build_experiment
@@ -239,7 +239,7 @@ def main(arguments: list[str]) -> int:
             print(f"{body}\n\n{table([run for run in runs if run.body == body])}\n")
         return 0
     if options.what != "brax":
-        xla_flags.set_flags()  # before JAX starts
+        exact.set_xla_flags()  # before JAX starts
     with tempfile.TemporaryDirectory() as folder:
         options.cache = options.cache or folder
         Path(options.cache).mkdir(parents=True, exist_ok=True)

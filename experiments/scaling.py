@@ -26,9 +26,8 @@ from typing import Any, NamedTuple
 import jax
 
 from experiments.benchmark import compile_part, measure
-from purerl import run
+from purerl import exact, run
 from purerl.core.errors import UserError, leave, output_file
-from purerl.exact import xla_flags
 from purerl.ppo import algorithm
 from purerl.runs import build_experiment, command_line
 from purerl.runs.experiment import Experiment, find
@@ -156,7 +155,7 @@ def main(arguments: list[str]) -> int:
     prog = "python -m experiments.scaling"
     experiment, _ = run.from_command_line(command_line.parse, find(options.experiment), words, prog)
     sweep = Sweep(options.experiment, words, experiment.ppo, options.minibatch)
-    xla_flags.set_flags()  # for seeds, in this process
+    exact.set_xla_flags()  # for seeds, in this process
     rows = []
     for axis, value in [(name, value) for name in options.axes for value in AXES[name]]:
         if axis == "seeds":

@@ -23,8 +23,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from purerl import exact
 from purerl.core.errors import USAGE, RunError, StoppedError, UserError, leave, tell
-from purerl.exact import xla_flags
 from purerl.runs import experiment
 from purerl.runs.experiment import Experiment, Source
 
@@ -113,7 +113,7 @@ def resume_command(arguments: Sequence[str]) -> str:
 
 def command(arguments: Sequence[str]) -> None:
     """Parses, prepares and trains."""
-    xla_flags.set_flags()  # before JAX starts
+    exact.set_xla_flags()  # before JAX starts
     from purerl.devices.processes import fail_together
     from purerl.runs.command_line import parse
     from purerl.runs.session import execute

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import jax
 
+from purerl import exact
 from purerl.core.records import Metrics, PyTree
-from purerl.exact.rewrite import list_scatter_sums
 
 # Up to so many cores, the evaluation is compiled when it is first needed, or the first update
 # would wait for it. With 16 cores all is compiled side by side: brax's ant came to its first
@@ -116,4 +116,4 @@ def when_needed(
 
 def unordered(traced: Any) -> list[str]:
     """Lists the sums of a traced program whose order nothing fixes on a GPU."""
-    return sorted({f"{s.primitive} at {s.source}" for s in list_scatter_sums(traced.jaxpr)})
+    return sorted({f"{s.primitive} at {s.source}" for s in exact.unordered_in(traced.jaxpr)})

@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
+from purerl import exact
 from purerl.core.env import Env
 from purerl.core.records import Array, Metrics, Network, PyTree, TrainState
 from purerl.devices.compilation import Compiling, shapes, start, unordered
 from purerl.devices.shards import AXIS, Shards, parts_of
 from purerl.devices.slices import count_slices, cut_in_slices
-from purerl.exact import xla_flags
 from purerl.ppo import algorithm
 from purerl.ppo.algorithm import Experience
 from purerl.ppo.config import Config
@@ -223,7 +223,7 @@ def compile_update(
             functools.partial(improve, config, network, shards),
             mesh=mesh, in_specs=(SAME, SPLIT), out_specs=SAME, check_vma=False,
         ),
-        compiler_options=xla_flags.equal_passes(),
+        compiler_options=exact.equal_passes(),
     )  # fmt: skip
     whole = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct((shards.number, *x.shape[1:]), x.dtype), experience

@@ -1,1 +1,25 @@
-"""The exact room."""
+"""Makes a JAX function bit-exact: the same bits in every run on one kind of device.
+
+It serves anybody with plain MJX: `exact.rewrite(mjx.step)`; see docs/exact.md.
+
+What belongs here: code that rewrites a traced function, and the choices of XLA that change bits.
+What it may import: JAX and numpy, and nothing else of purerl.
+Where to start reading: `rewriting.py` (the public function), `walk.py` (how a trace is run again
+with equations replaced), then the two sets of rules: `order.py` with `scatters.py`, the promise,
+and `fuse.py`, the optimisation. `xla_flags.py` stands alone.
+"""
+
+import importlib
+from typing import Any
+
+# Imported when they are asked for: `set_xla_flags` has to be called before JAX starts.
+_PUBLIC = dict.fromkeys(("unordered_sums", "unordered_in", "ScatterSum"), "order")
+_PUBLIC |= dict.fromkeys(("set_xla_flags", "how_chosen", "equal_passes"), "xla_flags")
+_PUBLIC["rewrite"] = "rewriting"
+__all__ = sorted(_PUBLIC)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PUBLIC:
+        raise AttributeError(f"purerl.exact has no {name!r}; it has {', '.join(__all__)}.")
+    return getattr(importlib.import_module(f"{__name__}.{_PUBLIC[name]}"), name)

@@ -1,12 +1,12 @@
-"""Values of a trace that are known before it runs: integers and truth values made of constants.
+"""Values of a trace that are known before it runs: integers and booleans computed from constants.
 
 MJX computes its indices from constants with JAX operations, tens of thousands of them in a large
-model. Here they are computed once, with numpy: JAX would compile a small program for each shape.
+model. Here numpy computes them, once: JAX would compile a small program for each shape.
 """
 
 import contextlib
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -14,19 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
-Known = Callable[[], np.ndarray] | None  # gives a value known while tracing
+from purerl.exact.traces import CALLS, bind_equation, called_jaxpr, evaluate
 
-# Primitives that only call one jaxpr: their body can be run in place.
-CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
-CALLS |= {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "checkpoint": "jaxpr"}
-CALLS |= {"remat2": "jaxpr", "remat": "jaxpr"}
+Known = Callable[[], np.ndarray] | None  # gives a value known while tracing
 
 
 def known_constant(const: Any) -> Known:
-    """A constant of the trace is known unless it is itself being traced."""
+    """Gives the value of a constant of a trace, unless that is itself being traced."""
     if isinstance(const, jax.core.Tracer) or not hasattr(const, "dtype"):
         return None
-    # Only indices matter here: keys and floating-point tables need never be fetched.
+    # Only indices matter: keys and floating-point tables need not be fetched from the device.
     return functools.partial(np.asarray, const) if _is_integral(const.dtype) else None
 
 
@@ -35,34 +32,35 @@ def known_literal(literal: core.Literal) -> Known:
     return functools.partial(np.asarray, literal.val, literal.aval.dtype)
 
 
-def called_jaxpr(eqn: core.JaxprEqn) -> core.ClosedJaxpr:
-    """Returns what an equation of `CALLS` calls."""
-    inner = eqn.params[CALLS[eqn.primitive.name]]
-    return inner if isinstance(inner, core.ClosedJaxpr) else core.ClosedJaxpr(inner, ())
-
-
-def fold(eqn: core.JaxprEqn, known: list[Known]) -> list[Known] | None:
-    """Says how to compute an equation's results, if ever asked; None where they are not known."""
-    if eqn.effects or any(k is None for k in known):
-        return None
-    if not all(_is_integral(v.aval.dtype) for v in eqn.outvars):
-        return None
+def fold(eqn: core.JaxprEqn, known: Sequence[Known]) -> list[Known]:
+    """Says how to compute each result of an equation, if ever asked; None if it is not known."""
+    integral = [_is_integral(v.aval.dtype) for v in eqn.outvars]
+    unknown: list[Known] = [None] * len(integral)
+    if eqn.effects or not any(integral):
+        return unknown
+    if None in known or not all(integral):
+        # A call may return known indices among other things: a derivative's first half does.
+        return _fold_trace(called_jaxpr(eqn), known) if eqn.primitive.name in CALLS else unknown
 
     @functools.cache
     def compute() -> list[np.ndarray]:
-        return _compute(eqn, [k() for k in known])
+        return _compute(eqn, *(k() for k in known))
 
     return [functools.partial(lambda i: compute()[i], i) for i in range(len(eqn.outvars))]
 
 
-def bind_equation(eqn: core.JaxprEqn, inputs: list) -> list:
-    """Runs one equation as it is."""
-    params = eqn.primitive.get_bind_params(eqn.params)
-    # jax before 0.10 returned the called functions apart.
-    called, params = params if isinstance(params, tuple) else ((), params)
-    with eqn.ctx.manager:
-        outputs = eqn.primitive.bind(*called, *inputs, **params)
-    return list(outputs) if eqn.primitive.multiple_results else [outputs]
+def _fold_trace(closed: core.ClosedJaxpr, known_args: Sequence[Known]) -> list[Known]:
+    """Says how to compute the results of a trace."""
+    jaxpr = closed.jaxpr
+    known = dict(zip(jaxpr.constvars, map(known_constant, closed.consts), strict=True))
+    known |= dict(zip(jaxpr.invars, known_args, strict=True))
+
+    def read(atom: Any) -> Known:
+        return known_literal(atom) if isinstance(atom, core.Literal) else known[atom]
+
+    for eqn in jaxpr.eqns:
+        known |= dict(zip(eqn.outvars, fold(eqn, [read(v) for v in eqn.invars]), strict=True))
+    return [read(v) for v in jaxpr.outvars]
 
 
 def _is_integral(dtype: Any) -> bool:
@@ -70,37 +68,24 @@ def _is_integral(dtype: Any) -> bool:
 
 
 def on_cpu() -> contextlib.AbstractContextManager:
-    """Computes on the CPU what is computed at once: a GPU's compiler takes its time over each."""
+    """Makes JAX compute on the CPU: a GPU's compiler takes long over each single operation."""
     try:
         return jax.default_device(jax.local_devices(backend="cpu")[0])
     except RuntimeError:  # JAX_PLATFORMS leaves the CPU out
         return contextlib.nullcontext()
 
 
-def _compute(eqn: core.JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
+def _compute(eqn: core.JaxprEqn, *values: np.ndarray) -> list[np.ndarray]:
     """Computes one equation of known inputs."""
     rule = _RULES.get(eqn.primitive.name)
     if eqn.primitive.name in CALLS:
-        outputs = _compute_jaxpr(called_jaxpr(eqn), values)
+        outputs = evaluate(called_jaxpr(eqn), _compute, np.asarray, *values)
     elif rule and all(_is_integral(v.dtype) for v in values):
         outputs = [rule(eqn.params, *values)]
     else:
         with jax.ensure_compile_time_eval(), on_cpu():
-            outputs = bind_equation(eqn, [jax.device_put(v) for v in values])
+            outputs = bind_equation(eqn, *map(jax.device_put, values))
     return [np.asarray(x, v.aval.dtype) for x, v in zip(outputs, eqn.outvars, strict=True)]
-
-
-def _compute_jaxpr(closed: core.ClosedJaxpr, values: list[np.ndarray]) -> list[np.ndarray]:
-    found = dict(zip(closed.jaxpr.constvars, map(np.asarray, closed.consts), strict=True))
-    found |= dict(zip(closed.jaxpr.invars, values, strict=True))
-
-    def read(atom):
-        return known_literal(atom)() if isinstance(atom, core.Literal) else found[atom]
-
-    for eqn in closed.jaxpr.eqns:
-        outputs = _compute(eqn, [read(v) for v in eqn.invars])
-        found.update(zip(eqn.outvars, outputs, strict=True))
-    return [read(v) for v in closed.jaxpr.outvars]
 
 
 def _broadcast(p: dict, x: np.ndarray) -> np.ndarray:
@@ -130,7 +115,7 @@ def _cumulative_sum(p: dict, x: np.ndarray) -> np.ndarray:
 
 
 def _remainder(p: dict, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    # As XLA has it: the sign of the dividend; x for y = 0.
+    # As in XLA: the result has the sign of the dividend, and is x for y = 0.
     return np.where(y == 0, x, np.fmod(x, np.where(y == 0, 1, y)))
 
 
@@ -139,26 +124,15 @@ def _select(p: dict, which: np.ndarray, *cases: np.ndarray) -> np.ndarray:
 
 
 # Integer arithmetic wraps around in numpy as in XLA.
+_ELEMENTWISE = {
+    "add": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative, "sign": np.sign,
+    "max": np.maximum, "min": np.minimum, "lt": np.less, "le": np.less_equal, "gt": np.greater,
+    "ge": np.greater_equal, "eq": np.equal, "ne": np.not_equal,
+    "and": np.bitwise_and, "or": np.bitwise_or, "not": np.invert,
+}  # fmt: skip
 _RULES: dict[str, Callable[..., np.ndarray]] = {
     name: functools.partial(lambda f, p, *values: f(*values), function)
-    for name, function in {
-        "add": np.add,
-        "sub": np.subtract,
-        "mul": np.multiply,
-        "neg": np.negative,
-        "max": np.maximum,
-        "min": np.minimum,
-        "lt": np.less,
-        "le": np.less_equal,
-        "gt": np.greater,
-        "ge": np.greater_equal,
-        "eq": np.equal,
-        "ne": np.not_equal,
-        "and": np.bitwise_and,
-        "or": np.bitwise_or,
-        "not": np.invert,
-        "sign": np.sign,
-    }.items()
+    for name, function in _ELEMENTWISE.items()
 }
 _RULES |= {"broadcast_in_dim": _broadcast, "slice": _slice, "rem": _remainder, "select_n": _select}
 _RULES |= {"iota": _iota, "cumsum": _cumulative_sum}

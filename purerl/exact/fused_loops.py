@@ -1,17 +1,17 @@
 """Loops over a few numbers and one long axis on a GPU, each as one kernel.
 
 In every round MJX's line search adds up three numbers of each constraint, for three points, and
-chooses between them. XLA makes four kernels of a round, and each waits for the one before. Here one
-warp makes all rounds of an environment: what they read and carry stays in its registers. What it
-computes is the trace of the loop's body, equation by equation; where there is no rule for one of
-them, the loop stays XLA's (elliptic cones, equalities, friction in joints or tendons).
+chooses between the points. XLA makes four kernels of a round, and each waits for the one before.
+Here one warp makes all rounds of an environment and keeps all arrays in its registers. It computes
+the trace of the loop's body, equation by equation. If there is no rule for an equation, the loop is
+left to XLA (elliptic cones, equalities, friction in joints or tendons).
 
-A value of the trace is an object array of the same rank. Its entries are numbers or, where one of
-its axes is the long one (size 1 here), vectors along it, [m]: m is the next power of 2 from n on.
+A value of the trace is an object array of the same rank. Its entries are numbers. If one of its
+axes is the long one, that axis has size 1 here, and the entries are vectors along it, [m], where m
+is the least power of 2 that is not below n.
 """
 
 import functools
-import math
 import operator
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, cast
@@ -19,13 +19,11 @@ from typing import Any, NamedTuple, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax import Array, lax
 from jax.extend import core
 
-from purerl.core.records import Array
 from purerl.exact import pallas_calls
-from purerl.exact.constants import CALLS, called_jaxpr
-from purerl.exact.traced_loops import equations, sub_jaxprs
+from purerl.exact.traces import CALLS, called_jaxpr, equations, evaluate, sub_jaxprs
 
 SHORT = 4  # entries of any other axis, at most
 LONGEST = 512  # of the long one: 16 registers of each thread for a vector
@@ -42,7 +40,7 @@ class Long(NamedTuple):
 
 def wanted(eqn: core.JaxprEqn) -> bool:
     """Tells whether an equation is a loop to be computed by one kernel."""
-    if eqn.primitive.name != "scan" or not pallas_calls.can_run():
+    if eqn.primitive.name != "scan":
         return False
     body = eqn.params["jaxpr"]
     carries_all = [v.aval for v in body.jaxpr.outvars] == [v.aval for v in eqn.outvars]
@@ -83,15 +81,15 @@ def _has_rule(eqn: core.JaxprEqn) -> bool:
     return known and (short or name not in _OF_SHORT_AXES)
 
 
-def compute(eqn: core.JaxprEqn, inputs: Sequence[Array]) -> list[Array]:
-    """Computes a loop that is `wanted`."""
+def compute(eqn: core.JaxprEqn, platform: str, *inputs: Array) -> list[Array]:
+    """Computes a loop that is `wanted`, by a kernel for a platform."""
     body = eqn.params["jaxpr"]
     size = _long_size(body)
     assert size is not None, "not wanted"
     kernel = functools.partial(_kernel, body, eqn.params["length"], size)
     results = [jax.ShapeDtypeStruct(a.shape, _kept(a.dtype)) for a in body.out_avals]
-    pairs = zip(inputs, body.in_avals, strict=True)
-    found = pallas_calls.call(kernel, results, *(jnp.asarray(x, _kept(a.dtype)) for x, a in pairs))
+    given = [jnp.asarray(x, _kept(a.dtype)) for x, a in zip(inputs, body.in_avals, strict=True)]
+    found = pallas_calls.call(kernel, results, *given, platform=platform)
     return [x.astype(a.dtype) for x, a in zip(found, body.out_avals, strict=True)]
 
 
@@ -101,7 +99,7 @@ def _kept(dtype: Any) -> Any:
 
 
 def _kernel(body: core.ClosedJaxpr, length: int, size: int, *references: Any) -> None:
-    """Reads all there is, makes all rounds, and writes what they carry."""
+    """Reads the inputs, makes all rounds, and writes the carry."""
     lane = lax.iota(jnp.int32, 1 << (size - 1).bit_length())
     long = Long(size, lane, lane < size)
     avals, number = body.in_avals, len(body.in_avals)
@@ -110,12 +108,12 @@ def _kernel(body: core.ClosedJaxpr, length: int, size: int, *references: Any) ->
     carry = values[len(consts) :]
     shapes = [value.shape for value in carry]
 
-    def step(i: Array, flat: list[Array]) -> list[Array]:
-        new = _flat(_evaluate(long, body, *consts, *_values(shapes, flat)))
-        # What a round sets to a number becomes what is carried: a vector, or no literal.
-        return [jnp.where(i >= 0, a, b) for a, b in zip(new, flat, strict=True)]
+    def step(i: Array, carry: list[list[Array]]) -> list[list[Array]]:
+        new = _evaluate(long, body, *consts, *map(_value, shapes, carry))
+        # A round may set what it carries to a constant: that becomes a vector, and no literal.
+        return jax.tree.map(lambda a, b: jnp.where(i >= 0, a, b), _entries(new), carry)
 
-    carry = _values(shapes, lax.fori_loop(0, length, step, _flat(carry)))
+    carry = list(map(_value, shapes, lax.fori_loop(0, length, step, _entries(carry))))
     for ref, value in zip(references[number:], carry, strict=True):
         _store(long, ref, value)
 
@@ -130,13 +128,8 @@ def _value(shape: Sequence[int], entries: Iterable[Any]) -> Value:
     return value
 
 
-def _values(shapes: Sequence[tuple[int, ...]], flat: Sequence[Array]) -> list[Value]:
-    left = iter(flat)
-    return [_value(shape, [next(left) for _ in range(math.prod(shape))]) for shape in shapes]
-
-
-def _flat(values: Iterable[Value]) -> list[Array]:
-    return [entry for value in values for entry in value.flat]
+def _entries(values: Iterable[Value]) -> list[list[Array]]:
+    return [list(value.flat) for value in values]
 
 
 def _places(long: Long, shape: Sequence[int]) -> list[tuple[Any, ...]]:
@@ -176,18 +169,11 @@ def _store(long: Long, ref: Any, value: Value) -> None:
 
 def _evaluate(long: Long, closed: core.ClosedJaxpr, *args: Value) -> list[Value]:
     """Runs a trace."""
-    values: dict[Any, Value] = {}
 
-    def read(atom: Any) -> Value:
-        return values[atom] if isinstance(atom, core.Var) else _constant(atom.val, atom.aval.dtype)
+    def apply(eqn: core.JaxprEqn, *inputs: Value) -> list[Value]:
+        return _RULES[eqn.primitive.name](long, eqn, *inputs)
 
-    consts = [_constant(x, jnp.result_type(x)) for x in closed.consts]
-    values.update(zip(closed.jaxpr.constvars, consts, strict=True))
-    values.update(zip(closed.jaxpr.invars, args, strict=True))
-    for eqn in closed.jaxpr.eqns:
-        outputs = _RULES[eqn.primitive.name](long, eqn, *map(read, eqn.invars))
-        values.update(zip(eqn.outvars, outputs, strict=True))
-    return [read(v) for v in closed.jaxpr.outvars]
+    return evaluate(closed, apply, _constant, *args)
 
 
 def _constant(x: Any, dtype: Any) -> Value:

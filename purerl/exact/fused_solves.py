@@ -1,12 +1,12 @@
 """Cholesky factors and triangular solves of small matrices on a GPU, each as one kernel.
 
 MJX factorises a matrix [nv, nv] for each environment and solves with it, several times in a physics
-step. JAX hands that to cuSOLVER and cuBLAS: four launches each, for pointers and flags, outside of
-CUDA graphs. Of an ant's physics step of 0.50 ms they were 0.19. These kernels, written in Pallas,
-take a matrix for each warp, which keeps it in registers (measured: `docs/gpu.md`).
+step. JAX calls cuSOLVER and cuBLAS for that. Each call makes four launches, outside of CUDA graphs;
+of an ant's physics step of 0.50 ms they took 0.19. In these kernels, written in Pallas, each warp
+takes one matrix and keeps it in registers (measured: `docs/gpu.md`).
 
-A warp works on [m, m], m the next power of 2 from 4 on, of a matrix [n, n]; beyond n it reads an
-identity.
+Of a matrix [n, n] a warp works on [m, m], where m is the least power of 2 that is not below n, and
+at least 4. Beyond n it reads an identity.
 """
 
 import functools
@@ -15,10 +15,9 @@ from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
-from jax import lax
+from jax import Array, lax
 from jax.extend import core
 
-from purerl.core.records import Array
 from purerl.exact import pallas_calls
 
 # Rows: a warp has registers for no more. A factor and two solves of 4,096 systems, here and by the
@@ -29,7 +28,7 @@ LARGEST = 32
 def wanted(eqn: core.JaxprEqn) -> bool:
     """Tells whether an equation is a factorisation or a solve to be computed by these kernels."""
     name = eqn.primitive.name
-    if name not in ("cholesky", "triangular_solve") or not pallas_calls.can_run():
+    if name not in ("cholesky", "triangular_solve"):
         return False
     matrix, *sides = [cast(Any, v.aval) for v in eqn.invars]
     small = matrix.ndim == 2 and 0 < matrix.shape[0] <= LARGEST and matrix.dtype == jnp.float32
@@ -39,41 +38,47 @@ def wanted(eqn: core.JaxprEqn) -> bool:
     return small and plain and sides[0].shape[1] == 1
 
 
-def compute(eqn: core.JaxprEqn, inputs: list[Array]) -> list[Array]:
-    """Computes an equation that is `wanted`."""
+def compute(eqn: core.JaxprEqn, platform: str, *inputs: Array) -> list[Array]:
+    """Computes an equation that is `wanted`, by a kernel for a platform."""
     if eqn.primitive.name == "cholesky":
-        return [cholesky(*inputs)]
+        return [cholesky(*inputs, platform=platform)]
     (matrix, side), p = inputs, eqn.params  # conjugate_a changes nothing of real numbers
-    found = triangular_solve(matrix, side[:, 0], lower=p["lower"], transposed=p["transpose_a"])
-    return [found[:, None]]
+    halves = {"lower": p["lower"], "transposed": p["transpose_a"]}
+    return [triangular_solve(matrix, side[:, 0], **halves, platform=platform)[:, None]]
 
 
-def cholesky(matrix: Array) -> Array:
+def cholesky(matrix: Array, *, platform: str | None = None) -> Array:
     """Returns the lower L [n, n] with L L^T = `matrix` [n, n], of which the lower half is read.
 
-    Where it is not positive definite, L is NaN from the first bad pivot on.
+    If the matrix is not positive definite, L is NaN from the first bad pivot on.
     """
-    return _call(_cholesky_kernel, matrix.shape, matrix)
+    return _call(_cholesky_kernel, matrix.shape, matrix, platform=platform)
 
 
-def triangular_solve(matrix: Array, side: Array, *, lower: bool, transposed: bool) -> Array:
-    """Returns x [n] with T x = `side` [n], T the `matrix` [n, n] or its transpose.
+def triangular_solve(
+    matrix: Array, side: Array, *, lower: bool, transposed: bool, platform: str | None = None
+) -> Array:
+    """Solves T x = `side`, where T is a triangular matrix or its transpose.
 
     Args:
-      matrix: of which only one half is read.
-      side: the right-hand side.
-      lower: which half.
+      matrix: [n, n], of which only one half is read.
+      side: [n], the right-hand side.
+      lower: whether that half is the lower one.
       transposed: whether T is the transpose.
+      platform: the platform to run on.
+
+    Returns:
+      x, [n].
     """
     kernel = functools.partial(_solve_kernel, lower, transposed)
-    return _call(kernel, side.shape, matrix, side)
+    return _call(kernel, side.shape, matrix, side, platform=platform)
 
 
-def _call(kernel: Callable, shape: tuple[int, ...], *inputs: Array) -> Array:
-    """Runs a kernel on one system; it is told m."""
+def _call(kernel: Callable, shape: tuple[int, ...], *inputs: Array, platform: str | None) -> Array:
+    """Runs a kernel, which is told m, on one system."""
     m = max(4, 1 << (shape[0] - 1).bit_length())
     result = jax.ShapeDtypeStruct(shape, jnp.float32)
-    return pallas_calls.call(functools.partial(kernel, m), [result], *inputs)[0]
+    return pallas_calls.call(functools.partial(kernel, m), [result], *inputs, platform=platform)[0]
 
 
 def _places(m: int) -> tuple[Array, Array]:

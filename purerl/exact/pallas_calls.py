@@ -6,19 +6,26 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-
-from purerl.core.records import Array
+from jax import Array
 
 AT_ONCE = 32  # arrays that one kernel copies: each takes registers
 BLOCK = 128  # entries of each that a warp copies, four a thread
+# Programs as for a GPU, whose kernels any device can run, slowly: for tests.
+INTERPRETED = "interpreted"
+GPUS = ("gpu", INTERPRETED)
 
 
-def can_run() -> bool:
-    """Tells whether programs are for a GPU, and JAX has Triton's part of Pallas.
+def target(platform: str | None) -> str:
+    """Returns the platform that is asked for; of None, that of JAX's default backend."""
+    return platform or jax.default_backend()
+
+
+def can_run(platform: str | None = None) -> bool:
+    """Tells whether a platform is a GPU, and JAX has Triton's part of Pallas.
 
     JAX means to remove it; then XLA's kernels and loops are used.
     """
-    if jax.default_backend() != "gpu":
+    if target(platform) not in GPUS:
         return False
     try:
         return importlib.util.find_spec("jax.experimental.pallas.triton") is not None
@@ -31,16 +38,18 @@ def call(
     results: list[jax.ShapeDtypeStruct],
     *inputs: Array,
     grid: tuple[int, ...] = (),
+    platform: str | None = None,
 ) -> list[Array]:
-    """Runs a kernel in one warp, or in a `grid` of them; vmapped, in so many for each.
+    """Runs a kernel in one warp, or in a `grid` of warps; under `vmap`, in as many for each.
 
     Args:
       kernel: takes a reference to each input, then to each result, and writes the results.
       results: their shapes and dtypes.
       *inputs: the arrays to read.
       grid: number of warps along each axis; `pallas.program_id` tells a kernel which it is.
+      platform: the platform to run on; only a GPU runs the kernel, others interpret it.
     """
-    # Imported here: it takes 0.1 s, of which a run on CPUs need not wait.
+    # Imported here: it takes 0.1 s, and a run on CPUs need not wait for it.
     from jax.experimental import pallas
     from jax.experimental.pallas import triton
 
@@ -49,12 +58,12 @@ def call(
         results,
         grid=grid,
         compiler_params=triton.CompilerParams(num_warps=1),
-        interpret=jax.default_backend() == "cpu",
+        interpret=target(platform) != "gpu",
     )(*inputs)
 
 
 def copy(rows: list[Array]) -> list[Array]:
-    """Returns arrays [n] as they are, copied by kernels of which XLA does not know what they do."""
+    """Returns arrays [n] unchanged, copied by kernels whose work XLA does not know."""
     copied: list[Array] = []
     for some in (rows[i : i + AT_ONCE] for i in range(0, len(rows), AT_ONCE)):
         results = [jax.ShapeDtypeStruct(row.shape, row.dtype) for row in some]

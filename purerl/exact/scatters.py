@@ -1,28 +1,29 @@
-"""Scatters with constant indices as gathers; a scatter-add's sums have a fixed order."""
+"""Scatters with known indices, computed by gathers: so the sums of a scatter-add have an order."""
 
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax import Array, lax
 from jax.extend import core
 
-from purerl.core.records import Array
 from purerl.exact.constants import Known
+from purerl.exact.traces import source
 
 _FEW_TERMS = 4
 
 
 def ordered_scatter(eqn: core.JaxprEqn, inputs: list, known: list[Known]) -> Array:
-    """A scatter-add as gathers added in the order of the updates.
+    """Computes a scatter-add by gathers, which are added in the order of the updates.
 
     Raises:
       RuntimeError: the primitive is not a scatter-add, or its indices are not known.
     """
     operand, _, updates = inputs
     if known[1] is None or "add" not in eqn.primitive.name:
+        why = "its indices are known only while running" if known[1] is None else "it is no sum"
         raise RuntimeError(
-            f"A {eqn.primitive.name} traced at {source(eqn)} has indices that are known "
-            "only while running, so its sum has no fixed order on a GPU. Ask for fewer readings, "
-            "or change the model so that MJX does not need it."
+            f"A {eqn.primitive.name} traced at {source(eqn)} cannot be given a fixed order: {why}. "
+            "Compute the indices of a sum from constants; of MJX, change the model or ask for "
+            "fewer readings, so that it is not needed."
         )
     addresses = _addresses(eqn, np.asarray(known[1]()))
     touched, turns = _order_of_sums(addresses, updates.size)
@@ -42,18 +43,18 @@ def ordered_scatter(eqn: core.JaxprEqn, inputs: list, known: list[Known]) -> Arr
 
 
 def puts(eqn: core.JaxprEqn) -> bool:
-    """Says whether an equation is a scatter that puts updates in their places, as `.set` does.
+    """Tells whether an equation is a scatter that puts updates in their places, as `.set` does.
 
-    `.apply` is called the same, and computes something of what stands there.
+    `.apply` has the same primitive, and computes a function of the values that stand there.
     """
     return eqn.primitive.name == "scatter" and eqn.params["update_jaxpr"] is None
 
 
 def gathered_scatter(eqn: core.JaxprEqn, inputs: list, known: list[Known]) -> Array:
-    """A scatter that `puts`, with constant indices, as one gather; of updates that meet, the last.
+    """Computes a scatter that `puts`, with known indices, by one gather.
 
     XLA has two kernels for a scatter, one of them a copy, and neither is fused with others. It
-    leaves open which of several updates is kept; the last here is the last in row-major order.
+    leaves open which of several updates at one place is kept; here it is the last.
     """
     operand, _, updates = inputs
     addresses = _addresses(eqn, np.asarray(known[1]()))
@@ -77,10 +78,10 @@ def _take(flat: Array, index: np.ndarray) -> Array:
 
 
 def _addresses(eqn: core.JaxprEqn, indices: np.ndarray) -> np.ndarray:
-    """Returns for each update the flat address it is added to; -1 where it is dropped.
+    """Returns for each update the flat address it is added to; -1 if it is dropped.
 
-    By XLA's definition of a scatter: each index vector says where a window of updates starts, and
-    a window that does not fit is dropped whole, or moved until it fits (mode CLIP).
+    This is XLA's definition of a scatter: each index vector says where a window of updates starts.
+    A window that does not fit is dropped whole or, in mode CLIP, moved until it fits.
     """
     shape, updates = eqn.invars[0].aval.shape, eqn.invars[2].aval
     d = eqn.params["dimension_numbers"]
@@ -117,11 +118,11 @@ def _order_of_sums(address: np.ndarray, none: int) -> tuple[np.ndarray, np.ndarr
 
     Args:
       address: [updates]; -1 where an update is dropped.
-      none: what stands for no update.
+      none: the number that stands for no update.
 
     Returns:
-      The addresses that receive any, [touched], ascending; and the number of the k-th update of
-      each, [turns, touched].
+      The addresses that receive an update, [touched], ascending; and for each the number of its
+      k-th update, [turns, touched].
     """
     kept = np.flatnonzero(address >= 0)
     order = kept[np.argsort(address[kept], kind="stable")]
@@ -130,11 +131,3 @@ def _order_of_sums(address: np.ndarray, none: int) -> tuple[np.ndarray, np.ndarr
     turn = np.arange(len(order)) - np.repeat(start, count)
     turns[turn, np.repeat(np.arange(len(touched)), count)] = order
     return touched, turns
-
-
-def source(eqn: core.JaxprEqn) -> str:
-    """Returns the file and line that traced an equation, outside of JAX itself."""
-    traceback = eqn.source_info.traceback
-    frames = traceback.frames if traceback else []
-    own = [f for f in frames if "/jax/_src/" not in f.file_name] or frames
-    return f"{own[0].file_name}:{own[0].line_num}" if own else "an unknown line"

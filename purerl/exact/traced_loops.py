@@ -1,65 +1,42 @@
-"""What a trace tells of a loop before it runs."""
+"""Facts about a loop that its trace tells before it runs."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import jax.numpy as jnp
 from jax.extend import core
 
 from purerl.exact.constants import Known
+from purerl.exact.traces import equations
 
-# A scan makes all its rounds. Beyond so many, the loop most likely ends far earlier: MuJoCo's
-# default is 100 iterations, of which a cartpole needs two.
+# A scan makes all its rounds. A loop that may make more than these most likely ends far earlier:
+# MuJoCo's default is 100 iterations, and a cart-pole needs two.
 MOST_ROUNDS = 16
-# Rounds written out one after another on a GPU, where every round copies what the loop carries: an
-# ant's physics alone was faster by 9%, its four rounds of line search written out (H100). That is
-# where `loop_kernels` does not take the loop.
+# Rounds written out one after another on a GPU, where every round copies the carry. With the four
+# rounds of its line search written out, an ant's physics was faster by 9% (H100). It matters for
+# loops that `fused_loops` does not take.
 WRITTEN_OUT = 4
 # Equations of a round to be written out. A line search has 300; a whole physics step, 6,000 for six
 # hinges, took three times as long to compile.
 FEW_EQUATIONS = 1000
-# Of what a loop reads XLA leaves the order in memory as it is. Where a line search reads [108, 3],
-# one thread adds the 108 of a column; of [3, 108] a warp does, for all columns in one kernel.
+# XLA keeps the layout of an array that a loop reads. If a line search reads [108, 3], one thread
+# adds the 108 of a column; of [3, 108] a warp does, for all columns in one kernel.
 MANY_ROWS = 32
 FEW_COLUMNS = 4
 
 
-def sub_jaxprs(eqn: core.JaxprEqn) -> list[core.ClosedJaxpr]:
-    """Returns the traces inside one equation (loop bodies, branches, called functions)."""
-    found = []
-    for value in eqn.params.values():
-        for item in value if isinstance(value, tuple | list) else (value,):
-            if isinstance(item, core.ClosedJaxpr):
-                found.append(item)
-            elif isinstance(item, core.Jaxpr):
-                found.append(core.ClosedJaxpr(item, ()))
-    return found
-
-
-def equations(closed: core.ClosedJaxpr) -> Iterator[core.JaxprEqn]:
-    """Yields all equations of a trace, at any depth, each before those inside of it."""
-    for eqn in closed.jaxpr.eqns:
-        yield eqn
-        for sub in sub_jaxprs(eqn):
-            yield from equations(sub)
-
-
 def has_loop(closed: core.ClosedJaxpr) -> bool:
-    """Tells whether a trace loops, at any depth, and not in rounds that are all written out."""
-    return any(map(is_loop, equations(closed)))
+    """Tells whether a trace has a loop at any depth."""
+    return any(map(_is_loop, equations(closed)))
 
 
-def is_loop(eqn: core.JaxprEqn) -> bool:
-    """Tells whether an equation is a loop."""
+def _is_loop(eqn: core.JaxprEqn) -> bool:
+    """Tells whether an equation is a loop; a scan whose rounds are all written out is none."""
     name, params = eqn.primitive.name, eqn.params
     return name == "while" or (name == "scan" and params["unroll"] < params["length"])
 
 
 def is_written_out(eqn: core.JaxprEqn) -> bool:
-    """Tells whether rounds of a loop pay written out: a short scan with no loop inside.
-
-    As MJX's line search is, where it is not one kernel (`loop_kernels`).
-    """
+    """Tells whether some rounds of a loop shall be written out: a short scan, no loop inside."""
     if eqn.primitive.name != "scan" or eqn.params["unroll"] > 1:
         return False
     body = eqn.params["jaxpr"]
@@ -72,10 +49,10 @@ def is_tall(x: Any) -> bool:
 
 
 def rounds(params: dict, known: list[Known]) -> int | None:
-    """Returns the most rounds of a `while` that counts to a constant, None of any other.
+    """Returns the greatest number of rounds of a `while` that counts to a constant, else None.
 
-    Its condition fails when a counter reaches a literal, whatever else ends it earlier, and each
-    round adds 1 to the counter.
+    Its condition fails when a counter reaches a literal, or earlier for other reasons; each round
+    adds 1 to the counter, which starts from a known number.
     """
     n, m = params["cond_nconsts"], params["body_nconsts"]
     test, body = params["cond_jaxpr"].jaxpr, params["body_jaxpr"].jaxpr

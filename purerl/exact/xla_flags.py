@@ -1,21 +1,21 @@
-"""Keeps XLA from choosing kernels by timing them, so that every process computes with the same.
+"""Keeps XLA from choosing kernels by timing them, so that every process runs the same kernels.
 
 On a GPU, XLA by default times several kernels for an operation and takes the fastest. Two processes
-may choose differently, and other kernels add in another order. Untimed, cuBLAS's own choice is good
-where a product is large enough (`slices.count_slices`); XLA's Triton products, of one untimed tile
-size, are not (slower: a rodent's physics by 10%, a gradient step by half; H100, jax 0.11.2). Of
-reductions it is the other way round: XLA's own are slow untimed, and it takes Triton's by rule when
-told to (a humanoid's physics faster by 9%, that of ants over gaps by 12%; ants on a floor, rodents
-and the learner alike).
+may choose differently, and another kernel adds in another order. Without timing:
 
-Most kernels are small, in a CUDA graph, and one after another unless XLA is told to let those run
-together that need nothing of each other. It changes no bit: `docs/gpu.md`.
+- cuBLAS chooses well for large products. XLA's Triton products have one tile size and are slower (a
+  rodent's physics by 10%, a gradient step by half; H100, jax 0.11.2), so they are off.
+- XLA's own reductions are slow, so it is told to take Triton's by rule (a humanoid's physics is
+  faster by 9%, that of ants over gaps by 12%; nothing else is slower).
+
+XLA is also told to run small kernels side by side in a CUDA graph if they do not depend on each
+other. That changes no bit (`docs/gpu.md`).
 """
 
 import os
 
 LEVEL = "xla_gpu_autotune_level"
-# In the place of what timing would have found out.
+# What XLA does instead of timing.
 RULES = {
     LEVEL: "0",
     "xla_gpu_enable_triton_gemm": "false",
@@ -25,8 +25,8 @@ GRAPHS = {
     "xla_gpu_command_buffer_scheduling_mode": "CONCURRENT",
     "xla_gpu_graph_min_graph_size": "1",
 }
-# Passes that change bits with the number of devices. The first is run for several alone, and makes
-# other sums; the second puts products together that share a factor, in an order that is arbitrary.
+# Passes that change bits with the number of devices. XLA runs the first for several devices alone,
+# and it changes sums; the second merges products that share a factor, in an arbitrary order.
 PASSES = "xla_disable_hlo_passes"
 UNEQUAL_PASSES = "spmd-simplify,dot-merger"
 FIXING_FLAGS = (
@@ -34,14 +34,14 @@ FIXING_FLAGS = (
     "xla_gpu_deterministic_ops=true",
     "xla_gpu_exclude_nondeterministic_ops=true",
 )
-# JAX keeps what XLA timed in an earlier process beside its own cache, and XLA takes it from there.
+# JAX keeps the timings of earlier processes beside its own cache, and XLA reads them there.
 KEPT_TIMINGS = "JAX_PERSISTENT_CACHE_ENABLE_XLA_CACHES"
 
 
-def set_flags() -> None:
-    """Sets what XLA_FLAGS does not; to be called before JAX starts.
+def set_xla_flags() -> None:
+    """Adds to XLA_FLAGS what the user has not set there; to be called before JAX starts.
 
-    Where it says anything of timing, that holds, and none of the `RULES` does.
+    If the user has set anything about timing, none of the `RULES` is added.
     """
     flags, wanted = os.environ.get("XLA_FLAGS", ""), dict(GRAPHS)
     if not any(name.partition("=")[0] in flags for name in FIXING_FLAGS):
@@ -52,16 +52,16 @@ def set_flags() -> None:
 
 
 def how_chosen(platform: str) -> str:
-    """Tells how kernels are chosen: "fixed", or "by timing" anew in each process."""
+    """Tells how XLA chooses kernels on a platform: "fixed", or "by timing" in each process."""
     flags = os.environ.get("XLA_FLAGS", "")
     fixed = platform != "gpu" or any(flag in flags for flag in FIXING_FLAGS)
     return "fixed" if fixed else "by timing"
 
 
 def equal_passes() -> dict[str, str]:
-    """Returns the compiler option for a program of several devices: which passes are off.
+    """Returns the compiler option that turns off `UNEQUAL_PASSES` in a program of several devices.
 
-    It takes the place of what XLA_FLAGS says of passes, so that is a part of it.
+    The option replaces the one in XLA_FLAGS, so it contains the user's passes too.
     """
     flags = (flag.lstrip("-").partition("=") for flag in os.environ.get("XLA_FLAGS", "").split())
     users = [value for name, _, value in flags if name == PASSES]

@@ -2,17 +2,15 @@
 
 import contextlib
 import io
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jax.extend import core
 
+from purerl import exact
 from purerl.core.records import Array, PyTree
-from purerl.exact.rewrite import trace_deterministic
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that warp, which is optional, is absent
     from mujoco import mjx
@@ -25,7 +23,14 @@ _IN_IMPL += ("subtree_angmom", "cacc", "cfrc_int", "cfrc_ext")
 class JaxEngine:
     """Steps a model with MJX; see `physics.Physics` for what `init` and `step` promise."""
 
-    def __init__(self, model: mujoco.MjModel, record: Any, late: tuple[str, ...], substeps: int):
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        record: Any,
+        late: tuple[str, ...],
+        substeps: int,
+        platform: str | None = None,
+    ):
         """Puts the model on the device.
 
         Args:
@@ -33,6 +38,7 @@ class JaxEngine:
           record: the NamedTuple of readings.
           late: the readings that are those of the last substep.
           substeps: physics steps in one control step.
+          platform: what `exact.rewrite` is told; None: the platform of this process's first device.
 
         Raises:
           ValueError: MJX refuses the model, or would leave out a part of it without a word.
@@ -43,50 +49,31 @@ class JaxEngine:
         with mjx_defaults():
             self.model = put_model(model)
             self.data = mjx.make_data(model, device=_own_device(), impl="jax")
-        self._traces: dict[Any, core.ClosedJaxpr] = {}
-        self._functions: dict[Any, Callable] = {}
+        # MJX takes seconds to trace: reset, training and evaluation share one trace of each.
+        platform = platform or _own_device().platform
+        self._exact_init = exact.rewrite(self.plain_init, platform=platform)
+        self._exact_step = exact.rewrite(self.plain_step, platform=platform)
 
     def init(self, state: PyTree, changes: dict[str, Array]) -> tuple:
         """Returns the readings at `state` under no control."""
-        return self.record(*self._run(self._init, state, changes))
+        with mjx_defaults():
+            return self._exact_init(state, changes)
 
     def step(self, state: PyTree, ctrl: Array, changes: dict[str, Array]) -> tuple[PyTree, tuple]:
         """Advances one control step."""
-        flat = self._run(self._step, state, ctrl, changes)
-        leaves, structure = jax.tree.flatten(state)
-        n = len(leaves)
-        return jax.tree.unflatten(structure, flat[:n]), self.record(*flat[n:])
+        with mjx_defaults():
+            return self._exact_step(state, ctrl, changes)
 
-    def trace(self, state: PyTree, ctrl: Array, changes: dict[str, Array]) -> core.ClosedJaxpr:
-        """Returns the rewritten trace of `step`, for inspection."""
-        return self._trace(self._step, state, ctrl, changes)
-
-    def _run(self, function, *args: PyTree) -> list[Array]:
-        """Runs the trace of `function`, made once for each set of shapes.
-
-        MJX takes seconds to trace; reset, training and evaluation share one trace.
-        """
-        closed = self._trace(function, *args)
-        if id(closed) not in self._functions:
-            # jit for a caller who has none: thousands of operations one by one take minutes.
-            self._functions[id(closed)] = jax.jit(core.jaxpr_as_fun(closed), inline=True)
-        return self._functions[id(closed)](*jax.tree.leaves(args))
-
-    def _trace(self, function, *args: PyTree) -> core.ClosedJaxpr:
-        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), args)
-        leaves, structure = jax.tree.flatten(shapes)
-        key = (function.__name__, structure, tuple((s.shape, s.dtype) for s in leaves))
-        if key not in self._traces:
-            with mjx_defaults():
-                self._traces[key] = trace_deterministic(function, *shapes)
-        return self._traces[key]
-
-    def _init(self, state: PyTree, changes: dict[str, Array]) -> list[Array]:
+    def plain_init(self, state: PyTree, changes: dict[str, Array]) -> tuple:
+        """Does what `init` does, with sums in any order."""
         model = self.model.tree_replace(changes) if changes else self.model
         data = _forward(model, load_state(self.data, state), bool(self.late))
         return self._read(data)
 
-    def _step(self, state: PyTree, ctrl: Array, changes: dict[str, Array]) -> list[Array]:
+    def plain_step(
+        self, state: PyTree, ctrl: Array, changes: dict[str, Array]
+    ) -> tuple[PyTree, tuple]:
+        """Does what `step` does, with sums in any order."""
         model = self.model.tree_replace(changes) if changes else self.model
 
         def substep(carry, _):
@@ -100,11 +87,11 @@ class JaxEngine:
         data = load_state(self.data, state).tree_replace(
             {_place(n): v for n, v in zip(self.late, late, strict=True)}
         )
-        return jax.tree.leaves(state) + self._read(_kinematics(model, data))
+        return state, self._read(_kinematics(model, data))
 
-    def _read(self, data: mjx.Data) -> list[Array]:
-        fields = self.record._fields
-        return [jnp.reshape(field_of(data, n), self.shapes[n]).astype(jnp.float32) for n in fields]
+    def _read(self, data: mjx.Data) -> tuple:
+        read = [jnp.reshape(field_of(data, n), shape) for n, shape in self.shapes.items()]
+        return self.record(*(x.astype(jnp.float32) for x in read))
 
 
 def check_known(model: mujoco.MjModel) -> None:

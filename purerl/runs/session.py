@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 
+from purerl import exact
 from purerl.core.errors import RunError, UserError
 from purerl.core.records import PyTree
 from purerl.devices import compilation, processes
@@ -21,7 +22,6 @@ from purerl.devices.check_sizes import check_minibatches, check_shards
 from purerl.devices.processes import alone
 from purerl.devices.programs import Programs, abstract_state, compile_programs
 from purerl.devices.shards import Shards
-from purerl.exact import xla_flags
 from purerl.ppo.config import Config
 from purerl.ppo.learner import is_recurrent
 from purerl.runs import build_experiment, checkpoint, console, loop, manifest, run_folder
@@ -111,7 +111,7 @@ def describe_process(
 ) -> dict[str, Any]:
     """Returns what the bits depend on besides the settings, as the manifest keeps it."""
     builders = (chosen.build_env, chosen.build_network)
-    chosen_by = xla_flags.how_chosen(jax.default_backend())
+    chosen_by = exact.how_chosen(jax.default_backend())
     facts = manifest.collect(setup.engine, builders, chosen_by, shards.number)
     facts["model"] = build_experiment.physics_hash(setup.env)
     if vmapped > 1:

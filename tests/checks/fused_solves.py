@@ -14,9 +14,10 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
-from purerl.core.records import Array
-from purerl.exact import fused_solves, xla_flags
+from purerl import exact
+from purerl.exact import fused_solves
 
 SIZES = {1: 4096, 3: 4096, 8: 4096, 14: 4096, 16: 4096, 23: 2048, 27: 4096, 32: 4096}
 ROUNDS = 50
@@ -69,7 +70,7 @@ def microseconds(solve: Callable, matrices: np.ndarray, sides: np.ndarray) -> fl
 
 def main() -> int:
     """Prints the table; exit code 0 if all errors are those of float32."""
-    xla_flags.set_flags()
+    exact.set_xla_flags()
     if jax.default_backend() != "gpu":
         sys.exit("JAX finds no GPU, and on a CPU these kernels are only interpreted.")
     row, right = "{:>4} {:>7} {:>10} {:>10} {:>12} {:>12}", True

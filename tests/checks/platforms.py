@@ -20,10 +20,9 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from purerl import run
+from purerl import exact, run
 from purerl.core.errors import leave
 from purerl.core.records import PyTree
-from purerl.exact import xla_flags
 from purerl.ppo import algorithm
 from purerl.runs import build_experiment, command_line, state_arrays
 from purerl.runs.build_experiment import Setup
@@ -42,7 +41,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--limit", type=float, default=1e-3, help="of relative differences")
     parser.add_argument("--write", default="", help="compute here, and write to this file instead")
     options, overrides = parser.parse_known_args(arguments)
-    xla_flags.set_flags()
+    exact.set_xla_flags()
     precision = os.environ.get("JAX_DEFAULT_MATMUL_PRECISION", "highest")
     jax.config.update("jax_default_matmul_precision", precision)
     prog = f"python -m tests.checks.platforms {options.experiment}"

@@ -7,25 +7,14 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxpr_as_fun
 
-from purerl.exact import fused_loops, pallas_calls, rewrite
-from purerl.exact.constants import CALLS
-from purerl.exact.rewrite import trace_deterministic
-from purerl.exact.traced_loops import equations
+from purerl import exact
+from purerl.exact import fused_loops
+from purerl.exact.traces import CALLS, equations
 from purerl.physics.interface import Physics
 from tests import quick
+from tests.exact import GPU, for_gpu, named, rewritten
 
 N = 40
-
-
-@pytest.fixture(autouse=True)
-def _for_gpu(monkeypatch):
-    monkeypatch.setattr(rewrite, "for_gpu", lambda: True)
-    monkeypatch.setattr(pallas_calls, "can_run", lambda: True)
-
-
-def count(closed, name):
-    """Not of what a kernel consists of."""
-    return sum(eqn.primitive.name == name for eqn in closed.jaxpr.eqns)
 
 
 def loop(body, carry, rounds=5):
@@ -97,8 +86,8 @@ FUNCTIONS = (search, carried, replaced, not_numbers, arithmetic)
 @pytest.mark.parametrize("function", FUNCTIONS)
 def test_a_loop_is_one_kernel(function):
     x = jax.random.normal(jax.random.key(0), (3, N))
-    closed = trace_deterministic(function, x[0])
-    assert count(closed, "pallas_call") == 1 and count(closed, "scan") == 0
+    closed = rewritten(function, x[0], platform=GPU)
+    assert len(named(closed, "pallas_call")) == 1 and not named(closed, "scan")
     got, want = jax.vmap(jaxpr_as_fun(closed))(x), jax.tree.leaves(jax.vmap(function)(x))
     for ours, theirs in zip(got, want, strict=True):
         assert ours.dtype == theirs.dtype
@@ -107,11 +96,9 @@ def test_a_loop_is_one_kernel(function):
 
 @pytest.mark.skipif(jax.__version_info__ >= (0, 11), reason="it asks a GPU what it is")
 @pytest.mark.parametrize("function", FUNCTIONS)
-def test_triton_takes_it(monkeypatch, function):
+def test_triton_takes_it(function):
     """Interpreted, a kernel may do what it may not on a GPU."""
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    x = jnp.zeros((3, N))
-    traced = jax.jit(jax.vmap(jaxpr_as_fun(trace_deterministic(function, x[0])))).trace(x)
+    traced = jax.jit(jax.vmap(exact.rewrite(function, platform="gpu"))).trace(jnp.zeros((3, N)))
     assert "triton" in traced.lower(lowering_platforms=("cuda",)).as_text()
 
 
@@ -150,8 +137,8 @@ LOOPS = {
 @pytest.mark.parametrize("name", LOOPS)
 def test_other_loops_stay(name):
     x = jax.random.normal(jax.random.key(0), (N,))
-    closed = trace_deterministic(LOOPS[name], x)
-    assert count(closed, "pallas_call") == 0 and count(closed, "scan") == 1
+    closed = rewritten(LOOPS[name], x, platform=GPU)
+    assert not named(closed, "pallas_call") and len(named(closed, "scan")) == 1
     got, want = jaxpr_as_fun(closed)(x), jax.tree.leaves(LOOPS[name](x))
     for ours, theirs in zip(got, want, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-5)
@@ -174,11 +161,12 @@ def physics_of_balls(cone):
     """Returns their physics for a GPU, states and controls of two, and its trace's kernels."""
     model = mujoco.MjModel.from_xml_string(BALLS.replace("CONE", cone))
     p, c = (Physics(model, ("xpos",), substeps=2, engine=engine) for engine in ("jax", "c"))
+    p = for_gpu(p)
     qpos = jnp.array(model.qpos0)[None].repeat(2, 0)
     qvel = jax.random.normal(jax.random.key(0), (2, model.nv))
     state, ctrl = jax.vmap(c.init)(qpos, qvel)[0], jnp.zeros((2, 0))
-    traced = p._engine.trace(*jax.tree.map(lambda x: x[0], (state, ctrl)), {})
-    return p, (state, ctrl), [e for e in equations(traced) if e.primitive.name == "pallas_call"]
+    traced = jax.make_jaxpr(p.step)(*jax.tree.map(lambda x: x[0], (state, ctrl)))
+    return p, (state, ctrl), named(traced, "pallas_call")
 
 
 def is_search(eqn):
@@ -188,7 +176,7 @@ def is_search(eqn):
 def test_the_line_search_of_a_physics_step_is_one_kernel():
     p, args, kernels = physics_of_balls("pyramidal")
     assert any(map(is_search, kernels))
-    plain = jax.make_jaxpr(jax.vmap(lambda s, u: p._engine._step(s, u, {})))(*args)
+    plain = jax.make_jaxpr(jax.vmap(lambda s, u: p._engine.plain_step(s, u, {})))(*args)
     found = quick.jit(jax.vmap(p.step))(*args)
     wanted = quick.jit(jaxpr_as_fun(plain))(*jax.tree.leaves(args))
     for x, y in zip(jax.tree.leaves(found), wanted, strict=True):

@@ -7,7 +7,7 @@ import pytest
 from jax.extend.core import jaxpr_as_fun
 
 from purerl.exact import fused_solves, pallas_calls
-from purerl.exact.rewrite import trace_deterministic
+from tests.exact import GPU, rewritten
 
 SIZES = (1, 2, 5, 14, 27, 32)
 
@@ -77,12 +77,11 @@ def solve_in_a_loop(matrix, side):
 
 
 @pytest.mark.parametrize("function", [solve, solve_in_a_loop])
-def test_on_a_gpu_the_trace_of_small_systems_has_their_kernels(function, monkeypatch):
+def test_on_a_gpu_the_trace_of_small_systems_has_their_kernels(function):
     sizes = jnp.zeros((7, 7)), jnp.zeros(7)
-    plain = str(trace_deterministic(function, *sizes))
+    plain = str(rewritten(function, *sizes))
     assert "cholesky" in plain and "pallas_call" not in plain
-    monkeypatch.setattr(pallas_calls, "can_run", lambda: True)
-    traced = trace_deterministic(function, *sizes)
+    traced = rewritten(function, *sizes, platform=GPU)
     assert "pallas_call" in str(traced) and "cholesky" not in str(traced.jaxpr.eqns)
     run = jax.vmap(jaxpr_as_fun(traced))
     matrices = np.stack([positive_matrix(7, seed) for seed in range(3)])
@@ -99,29 +98,26 @@ def test_on_a_gpu_the_trace_of_small_systems_has_their_kernels(function, monkeyp
         (solve, [(fused_solves.LARGEST + 1,) * 2, (fused_solves.LARGEST + 1,)]),
     ],
 )
-def test_larger_systems_are_left_to_the_library(function, shapes, monkeypatch):
-    monkeypatch.setattr(pallas_calls, "can_run", lambda: True)
-    assert "pallas_call" not in str(trace_deterministic(function, *map(jnp.zeros, shapes)))
+def test_larger_systems_are_left_to_the_library(function, shapes):
+    assert "pallas_call" not in str(rewritten(function, *map(jnp.zeros, shapes), platform=GPU))
 
 
-def test_several_right_hand_sides_are_left_to_the_library(monkeypatch):
-    monkeypatch.setattr(pallas_calls, "can_run", lambda: True)
-    traced = trace_deterministic(
+def test_several_right_hand_sides_are_left_to_the_library():
+    traced = rewritten(
         lambda a, b: jax.lax.linalg.triangular_solve(a, b, left_side=True, lower=True),
-        jnp.zeros((4, 4)), jnp.zeros((4, 2)),
+        jnp.zeros((4, 4)), jnp.zeros((4, 2)), platform=GPU,
     )  # fmt: skip
     assert "pallas_call" not in str(traced)
 
 
-def test_a_system_inside_of_what_cannot_be_rewritten_is_left_to_the_library(monkeypatch):
+def test_a_system_inside_of_what_cannot_be_rewritten_is_left_to_the_library():
     def function(matrix, side):
         return jax.lax.custom_linear_solve(
             lambda x: matrix @ x, side, lambda _, b: solve(matrix, b), symmetric=True
         )
 
-    monkeypatch.setattr(pallas_calls, "can_run", lambda: True)
     matrix, side = positive_matrix(4), np.ones(4, np.float32)
-    traced = trace_deterministic(function, matrix, side)
+    traced = rewritten(function, matrix, side, platform=GPU)
     assert "cholesky" in str(traced)
     (found,) = jaxpr_as_fun(traced)(matrix, side)
     assert close(found, np.linalg.solve(matrix.astype(np.float64), side))

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from purerl.exact.rewrite import trace_deterministic
-from purerl.exact.traced_loops import equations, has_loop
+from purerl.exact.traced_loops import has_loop
+from purerl.exact.traces import equations
+from tests.exact import rewritten
 
 LIMIT = 5
 
@@ -33,7 +34,7 @@ def primitives(closed):
 
 def test_a_counted_loop_becomes_a_scan_that_stops_where_the_loop_did():
     x = jnp.array([1.0, 2.0, 50.0, 1e6])  # done at once, early, late, and cut off by the count
-    closed = trace_deterministic(newton, x[0])
+    closed = rewritten(newton, x[0])
     assert "while" not in primitives(closed) and "scan" in primitives(closed)
     got = jax.vmap(jax.extend.core.jaxpr_as_fun(closed))(x)
     want = jax.vmap(newton)(x)
@@ -42,8 +43,12 @@ def test_a_counted_loop_becomes_a_scan_that_stops_where_the_loop_did():
         np.testing.assert_array_equal(a, b)
 
 
+def test_only_the_optimisation_makes_scans_of_loops():
+    assert "while" in primitives(rewritten(newton, 2.0, fuse=False))
+
+
 def test_the_count_may_begin_anywhere_that_is_known():
-    closed = trace_deterministic(lambda x: newton(x, start=3), jnp.float32(1e6))
+    closed = rewritten(lambda x: newton(x, start=3), jnp.float32(1e6))
     assert "while" not in primitives(closed)
     assert int(jax.extend.core.jaxpr_as_fun(closed)(jnp.float32(1e6))[0]) == LIMIT
 
@@ -62,7 +67,7 @@ def test_the_count_may_begin_anywhere_that_is_known():
     ],
 )
 def test_other_loops_stay(loop):
-    closed = trace_deterministic(loop, jnp.float32(3.0))
+    closed = rewritten(loop, jnp.float32(3.0))
     assert "while" in primitives(closed)
     got = jax.extend.core.jaxpr_as_fun(closed)(jnp.float32(3.0))
     for a, b in zip(got, jax.tree.leaves(loop(jnp.float32(3.0))), strict=True):

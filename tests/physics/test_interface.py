@@ -13,8 +13,8 @@ import pytest
 from dm_control import suite
 
 from envs import run
-from purerl.exact.rewrite import list_scatter_sums, trace_deterministic
-from purerl.exact.traced_loops import equations
+from purerl import exact
+from purerl.exact.traces import equations
 from purerl.physics import lookup
 from purerl.physics.interface import CHANGEABLE_FIELDS, READINGS, Physics, choose_engine
 from tests import quick
@@ -362,75 +362,12 @@ def test_look_ups_by_name():
     np.testing.assert_allclose(ctrl, [1.0, -1.0])
 
 
-def rough(x):
-    """Scatter sums in every kind of place, with indices that meet and one that is out of range."""
-    index = np.array([2, 0, 2, 2, 9, 0])
-    add = lambda c: c.at[index].add(x[:6])  # noqa: E731
-    rows = jnp.zeros((4, 2)).at[np.array([1, 1, 3])].add(x[:6].reshape(3, 2))
-    looped = jax.lax.fori_loop(0, 3, lambda i, c: add(c) * 0.5, jnp.zeros(5))
-    whiled = jax.lax.while_loop(lambda c: c.sum() < 3.0, lambda c: add(c) + 1.0, jnp.zeros(5))
-    scanned, _ = jax.lax.scan(lambda c, y: (add(c) * y, None), jnp.zeros(5), x[:3])
-    branch = jax.lax.cond(x[0] > 0, add, lambda c: c, jnp.ones(5))
-    segments = jax.vmap(lambda y: jax.ops.segment_sum(y, index[:3], 4))(x[:6].reshape(2, 3))
-    many = jnp.zeros(2).at[np.zeros(12, int)].add(jnp.tile(x[:6], 2))
-    corners = jax.vmap(lambda c, i: jax.lax.dynamic_slice(c, i, (2, 2)), (None, 0))
-    overlap = jax.vjp(lambda c: corners(c, np.array([[0, 1], [1, 0], [9, 9]])), jnp.ones((3, 4)))
-    clipped = overlap[1](x.repeat(2)[:12].reshape(3, 2, 2))[0]
-    own = jax.vmap(lambda y, i: jnp.zeros((3, 2)).at[i, 1].add(y))  # batch axes of a scatter
-    batched = own(x[:6].reshape(2, 3), np.array([[0, 0, 2], [1, 2, 1]]))
-    tables = jax.vmap(lambda y: own(y, np.array([[0, 0, 2], [1, 2, -1]])))(x[:6].reshape(1, 2, 3))
-    return rows, looped, whiled, scanned, branch, segments, many, clipped, batched, tables
-
-
-def test_rewritten_sums_are_the_same_sums():
-    x = jax.random.uniform(jax.random.key(0), (8,))
-    closed = trace_deterministic(rough, x)
-    assert len(list_scatter_sums(jax.make_jaxpr(rough)(x))) >= 10
-    assert not list_scatter_sums(closed)
-    rewritten = jax.jit(jax.vmap(jax.extend.core.jaxpr_as_fun(closed)))(jnp.stack([x, -x]))
-    for got, one, two in zip(rewritten, rough(x), rough(-x), strict=True):
-        np.testing.assert_allclose(got, jnp.stack([one, two]), rtol=1e-5)
-
-
-def indices(x):
-    """Integer arithmetic on constants of every kind that MJX has, and gathers where it leads."""
-    i = jnp.arange(-6, 6)
-    parts = [i % 4, i // 4, jnp.where(i > 2, i, -i), jnp.clip(i, -1, 3), jax.lax.rem(i, 4)]
-    parts += [jnp.concatenate([i[::3], i[2:4]]), i.reshape(3, 4).T[1], i[None].repeat(2, 0)[0]]
-    parts += [jnp.minimum(i, 2) * jnp.sign(i), jnp.invert(i), (i == 2) | ~(i < 0), i.astype(bool)]
-    parts += [jnp.cumsum(i), jnp.zeros(4, jnp.int32).at[np.array([1, 1, 3])].add(2), jnp.abs(i)]
-    return [(part, x[part.astype(jnp.int32)]) for part in parts]
-
-
-def test_known_integers_are_computed_as_jax_computes_them():
-    def both(x):  # the sum makes the rewriting enter a loop, whose body knows the integers too
-        loop = jax.lax.fori_loop(0, 2, lambda i, c: c.at[np.array([0, 0])].add(1.0), x)
-        return indices(x), indices(loop)
-
-    x = jax.random.uniform(jax.random.key(0), (8,))
-    closed = trace_deterministic(both, x)
-    for got, want in zip(
-        jax.extend.core.jaxpr_as_fun(closed)(x), jax.tree.leaves(both(x)), strict=True
-    ):
-        assert got.dtype == want.dtype
-        np.testing.assert_array_equal(got, want)
-    names = {eqn.primitive.name for eqn in closed.jaxpr.eqns}
-    assert not names & {"rem", "select_n", "cumsum", "lt"}, "left for the compiler"
-
-
-def test_a_sum_at_indices_known_only_later_is_refused():
-    with pytest.raises(RuntimeError, match="test_physics.py:.* known only while running"):
-        trace_deterministic(lambda i: jnp.zeros(3).at[i].add(jnp.ones(4)), jnp.arange(4))
-
-
 def step_trace(model, rewritten, readings=("xpos", "subtree_com", "cvel")):
     p = Physics(model, readings, substeps=2, engine="jax")
     p_c = Physics(model, (), substeps=2, engine="c")
     state, _ = p_c.init(model.qpos0, np.zeros(model.nv))
     arguments = (state, jnp.zeros(model.nu, jnp.float32), {})
-    if rewritten:
-        return p._engine.trace(*arguments)
-    return jax.make_jaxpr(p._engine._step)(*arguments)
+    return jax.make_jaxpr(p._engine.step if rewritten else p._engine.plain_step)(*arguments)
 
 
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
@@ -438,26 +375,26 @@ def test_no_scatter_sum_is_left_in_a_humanoid(jacobian):
     model = suite.load("humanoid", "run").physics.model.ptr
     model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     model.opt.jacobian = {"dense": 0, "sparse": 1}[jacobian]
-    assert len(list_scatter_sums(step_trace(model, rewritten=False))) > 20
-    assert not list_scatter_sums(step_trace(model, rewritten=True))
+    assert len(exact.unordered_in(step_trace(model, rewritten=False))) > 20
+    assert not exact.unordered_in(step_trace(model, rewritten=True))
 
 
 @pytest.mark.parametrize("body", ["ant", "rodent"])
 def test_no_scatter_sum_is_left_in_the_bodies_of_dm_control(body):
     env = run.build(run.Options(body=body), engine="jax")
-    assert not list_scatter_sums(step_trace(env.physics.model, True, run.READINGS))
+    assert not exact.unordered_in(step_trace(env.physics.model, True, run.READINGS))
 
 
 def test_no_scatter_sum_is_left_in_a_cartpole():
     model = suite.load("cartpole", "swingup").physics.model.ptr
     model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)  # MJX has none
-    assert not list_scatter_sums(step_trace(model, rewritten=True))
+    assert not exact.unordered_in(step_trace(model, rewritten=True))
 
 
 def test_no_scatter_sum_is_left_with_forces_and_sensors():
     readings = ("cfrc_ext", "sensordata", "ten_length", "qfrc_actuator")
-    assert list_scatter_sums(step_trace(biped(), False, readings))
-    assert not list_scatter_sums(step_trace(biped(), True, readings))
+    assert exact.unordered_in(step_trace(biped(), False, readings))
+    assert not exact.unordered_in(step_trace(biped(), True, readings))
 
 
 def test_rewriting_changes_no_number_of_mjx():
@@ -465,8 +402,8 @@ def test_rewriting_changes_no_number_of_mjx():
     state = jax.tree.map(lambda x: x[-1], trajectory("c")[1])
     ctrl = jnp.full((NUMBER, 2), 0.5)
     rewritten = compiled("jax")[1](state, ctrl)
-    plain = quick.jit(jax.vmap(lambda s, u: p._engine._step(s, u, {})))(state, ctrl)
-    for x, y in zip(jax.tree.leaves(rewritten), plain, strict=True):
+    plain = quick.jit(jax.vmap(lambda s, u: p._engine.plain_step(s, u, {})))(state, ctrl)
+    for x, y in zip(*map(jax.tree.leaves, (rewritten, plain)), strict=True):
         scale = max(1.0, float(jnp.abs(y).max(initial=0.0)))
         np.testing.assert_allclose(x / scale, y / scale, atol=1e-5)
 

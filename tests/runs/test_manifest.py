@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+from purerl import exact
 from purerl.devices import programs
 from purerl.devices.shards import Shards
 from purerl.exact import xla_flags
-from purerl.exact.rewrite import list_scatter_sums
 from purerl.ppo import algorithm
 from purerl.ppo.config import Evaluation
 from purerl.runs import manifest
@@ -119,11 +119,11 @@ OWN_GRAPHS = "--xla_gpu_command_buffer_scheduling_mode=LHS --xla_gpu_graph_min_g
 def test_kernels_are_fixed_unless_the_user_wants_them_timed(monkeypatch, users, after, chosen):
     monkeypatch.setenv("XLA_FLAGS", users or "")
     monkeypatch.delenv(xla_flags.KEPT_TIMINGS, raising=False)
-    xla_flags.set_flags()
+    exact.set_xla_flags()
     assert (xla_flags.KEPT_TIMINGS in os.environ) == (RULES in after)
     assert os.environ["XLA_FLAGS"] == after
-    assert xla_flags.how_chosen("gpu") == chosen and xla_flags.how_chosen("cpu") == "fixed"
-    reasons = manifest.collect("jax", [], xla_flags.how_chosen("gpu"))["inexact_because"]
+    assert exact.how_chosen("gpu") == chosen and exact.how_chosen("cpu") == "fixed"
+    reasons = manifest.collect("jax", [], exact.how_chosen("gpu"))["inexact_because"]
     assert ["by timing" in reason for reason in reasons] == [True] * (chosen == "by timing")
 
 
@@ -133,7 +133,7 @@ def test_no_update_has_a_sum_without_a_fixed_order(name):
     config, env, network, _ = build(dataclasses.replace(source, engine="jax"))
     update = functools.partial(algorithm.update, config, env, network)
     trace = jax.make_jaxpr(update)(programs.abstract_state(config, env, network))
-    assert list_scatter_sums(trace) == []
+    assert exact.unordered_in(trace) == []
 
 
 def test_a_sum_without_a_fixed_order_is_found(monkeypatch):

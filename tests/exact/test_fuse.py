@@ -1,4 +1,6 @@
-"""What is rewritten for a GPU alone, run on a CPU: scatters as gathers, loops written out."""
+"""What the optimisation does for a GPU, run on a CPU: scatters as gathers, loops written out."""
+
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -7,11 +9,14 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxpr_as_fun
 
-from purerl.exact import rewrite, traced_loops
-from purerl.exact.rewrite import trace_deterministic
-from purerl.exact.traced_loops import WRITTEN_OUT, equations
+from purerl.exact import traced_loops
+from purerl.exact.traced_loops import WRITTEN_OUT
 from purerl.physics.interface import Physics
+from tests import exact as shared
 from tests import quick
+from tests.exact import GPU, for_gpu, named
+
+rewritten = functools.partial(shared.rewritten, platform=GPU)
 
 # A ball joint, whose quaternion is put together by parts, and a hinge that its limit stops.
 ARM = """
@@ -29,15 +34,6 @@ ARM = """
   </worldbody>
 </mujoco>
 """
-
-
-@pytest.fixture(autouse=True)
-def _for_gpu(monkeypatch):
-    monkeypatch.setattr(rewrite, "for_gpu", lambda: True)
-
-
-def named(closed, name):
-    return [eqn for eqn in equations(closed) if eqn.primitive.name == name]
 
 
 INDEX = np.array([2, 0, 2, 7, -9])
@@ -62,7 +58,7 @@ SCATTERS = {
 def test_what_is_put_at_known_places_is_gathered(name):
     function = SCATTERS[name]
     x = jax.random.uniform(jax.random.key(0), (2, 8))
-    closed = trace_deterministic(function, x[0])
+    closed = rewritten(function, x[0])
     assert named(jax.make_jaxpr(function)(x[0]), "scatter"), "nothing to show"
     assert not named(closed, "scatter")
     (got,) = jax.vmap(jaxpr_as_fun(closed))(x)
@@ -80,12 +76,12 @@ def test_what_is_put_at_known_places_is_gathered(name):
 )
 def test_what_is_computed_in_its_place_stays(function):
     x = jnp.arange(1.0, 9.0)
-    (got,) = jaxpr_as_fun(trace_deterministic(function, x))(x)
+    (got,) = jaxpr_as_fun(rewritten(function, x))(x)
     np.testing.assert_array_equal(got, function(x))
 
 
 def test_what_is_put_at_places_known_only_later_stays():
-    closed = trace_deterministic(lambda x, i: x.at[i].set(7.0), jnp.zeros(3), jnp.arange(2))
+    closed = rewritten(lambda x, i: x.at[i].set(7.0), jnp.zeros(3), jnp.arange(2))
     assert named(closed, "scatter")
     np.testing.assert_array_equal(jaxpr_as_fun(closed)(jnp.zeros(3), jnp.arange(2))[0], [7, 7, 0])
 
@@ -99,7 +95,7 @@ def test_only_the_innermost_of_loops_is_written_out(length):
         return jax.lax.scan(lambda c, _: (inner(c * x)[1].sum(), c), x[0], None, 5)
 
     x = jax.random.uniform(jax.random.key(0), (2, 8))
-    closed = trace_deterministic(nested, x[0])
+    closed = rewritten(nested, x[0])
     assert [eqn.params["unroll"] for eqn in named(closed, "scan")] == [1, min(length, WRITTEN_OUT)]
     for got, want in zip(jax.vmap(jaxpr_as_fun(closed))(x), jax.vmap(nested)(x), strict=True):
         np.testing.assert_allclose(got, want, rtol=1e-6)
@@ -110,9 +106,9 @@ def test_a_long_round_is_not_written_out(monkeypatch):
         return jax.lax.scan(lambda c, _: (jnp.sin(c) + 1.0, None), x, None, 5)[0]
 
     monkeypatch.setattr(traced_loops, "FEW_EQUATIONS", 2)
-    assert [e.params["unroll"] for e in named(trace_deterministic(loop, 1.0), "scan")] == [1]
+    assert [e.params["unroll"] for e in named(rewritten(loop, 1.0), "scan")] == [1]
     monkeypatch.setattr(traced_loops, "FEW_EQUATIONS", 3)
-    assert [e.params["unroll"] for e in named(trace_deterministic(loop, 1.0), "scan")] == [4]
+    assert [e.params["unroll"] for e in named(rewritten(loop, 1.0), "scan")] == [4]
 
 
 def test_a_loop_reads_rows_of_few_numbers_by_column():
@@ -128,7 +124,7 @@ def test_a_loop_reads_rows_of_few_numbers_by_column():
         return jax.lax.scan(body, jnp.zeros(3), None, 9)[0]
 
     x = jax.random.normal(jax.random.key(0), (2, 40))
-    closed = trace_deterministic(search, x[0])
+    closed = rewritten(search, x[0])
     (loop,) = named(closed, "scan")
     shapes = [v.aval.shape for v in loop.invars]
     assert (3, 40) in shapes and (40, 3) not in shapes and (5, 8) in shapes
@@ -139,12 +135,13 @@ def test_a_loop_reads_rows_of_few_numbers_by_column():
 def test_a_physics_step_for_a_gpu_is_the_same_step():
     model = mujoco.MjModel.from_xml_string(ARM)
     p, c = (Physics(model, ("xpos", "cvel"), substeps=3, engine=engine) for engine in ("jax", "c"))
+    p = for_gpu(p)
     qpos = jnp.array([[1.0, 0.0, 0.0, 0.0, 0.3], [0.6, 0.0, 0.8, 0.0, -0.1]])  # one at its limit
     qvel = jnp.array([[1.0, -2.0, 0.5, 3.0], [0.5, 1.0, 0.0, 1.0]])
     state, _ = jax.vmap(c.init)(qpos, qvel)
     ctrl = jnp.zeros((2, 0))
-    traced = p._engine.trace(*jax.tree.map(lambda x: x[0], (state, ctrl)), {})
-    plain = jax.make_jaxpr(jax.vmap(lambda s, u: p._engine._step(s, u, {})))(state, ctrl)
+    traced = jax.make_jaxpr(p.step)(*jax.tree.map(lambda x: x[0], (state, ctrl)))
+    plain = jax.make_jaxpr(jax.vmap(lambda s, u: p._engine.plain_step(s, u, {})))(state, ctrl)
     assert named(plain, "scatter")
     assert not named(traced, "scatter")
     assert any(eqn.params["unroll"] == WRITTEN_OUT for eqn in named(traced, "scan"))
@@ -153,3 +150,18 @@ def test_a_physics_step_for_a_gpu_is_the_same_step():
     for x, y in zip(jax.tree.leaves(found), wanted, strict=True):
         scale = max(1.0, float(jnp.abs(y).max(initial=0.0)))
         np.testing.assert_allclose(x / scale, y / scale, atol=1e-6)
+
+
+def test_nothing_of_it_is_done_for_a_cpu_or_unless_asked():
+    def function(x):
+        solved = jnp.linalg.cholesky(jnp.eye(3) + x[0])
+        return jax.lax.scan(lambda c, _: (jnp.sin(c) + solved[0], None), x, None, 5)[0].at[0].set(1)
+
+    def steps(closed):
+        names = [name for name in ("pallas_call", "scatter", "cholesky") if named(closed, name)]
+        return names, [eqn.params["unroll"] for eqn in named(closed, "scan")]
+
+    x = jnp.ones(3)
+    assert steps(rewritten(function, x)) == (["pallas_call"], [WRITTEN_OUT])
+    assert steps(rewritten(function, x, platform="cpu")) == (["scatter", "cholesky"], [1])
+    assert steps(rewritten(function, x, fuse=False)) == (["scatter", "cholesky"], [1])

@@ -1,0 +1,82 @@
+"""The promise: every sum of a trace has a fixed order.
+
+On a GPU a scatter-add is atomic: terms that meet at one address are added in the order in which
+they arrive, so two runs differ in their last bits. The rule here replaces each scatter-add whose
+indices are constants of the trace (`scatters.py`). `check_ordered` raises an error if a sum is
+left. Nothing of `fuse.py` is needed for that.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.extend import core
+
+from purerl.exact.scatters import ordered_scatter
+from purerl.exact.traces import equations, source
+from purerl.exact.walk import Rule
+
+_SUMS = ("scatter-add", "scatter_add", "scatter-mul", "scatter_mul", "scatter-sub", "scatter_sub")
+
+
+class ScatterSum(NamedTuple):
+    """One scatter primitive whose result may depend on the order of its sums."""
+
+    primitive: str
+    shape: tuple[int, ...]  # of the operand
+    source: str  # file and line that traced it
+
+
+def unordered_sums(f: Callable, *example: Any) -> list[ScatterSum]:
+    """Lists the sums of a function whose order nothing fixes on a GPU.
+
+    Args:
+      f: a pure function of pytrees of arrays.
+      *example: its arguments, or `jax.ShapeDtypeStruct`s of the same shapes. Nothing is computed.
+
+    Returns:
+      The sums at any depth, in the order in which they are traced.
+    """
+    return unordered_in(jax.make_jaxpr(f)(*example))
+
+
+def unordered_in(closed: core.ClosedJaxpr) -> list[ScatterSum]:
+    """Lists the sums of a trace whose order nothing fixes on a GPU, at any depth."""
+    return [
+        ScatterSum(eqn.primitive.name, eqn.invars[0].aval.shape, source(eqn))
+        for eqn in equations(closed)
+        if is_unordered(eqn)
+    ]
+
+
+def is_unordered(eqn: core.JaxprEqn) -> bool:
+    """Tells whether an equation adds or multiplies numbers in an order that nothing fixes.
+
+    Sums of integers are exact in any order, and `unique_indices` promises that no terms meet.
+    """
+    sums = eqn.primitive.name in _SUMS and not eqn.params["unique_indices"]
+    return sums and jnp.issubdtype(eqn.invars[0].aval.dtype, jnp.inexact)
+
+
+def _in_order(eqn, inputs, known, inside) -> list | None:
+    return [ordered_scatter(eqn, inputs, known)] if is_unordered(eqn) else None
+
+
+RULE = Rule(is_unordered, _in_order)
+
+
+def check_ordered(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
+    """Returns a trace that has no sum without a fixed order.
+
+    Raises:
+      RuntimeError: it has one.
+    """
+    left = unordered_in(closed)
+    if left:
+        raise RuntimeError(
+            f"{len(left)} sums without a fixed order are left after rewriting, the first is "
+            f"{left[0]}: they stand inside an operation that purerl.exact cannot rewrite. Use the "
+            "versions in the constraints file, or move the sum out of that operation."
+        )
+    return closed

@@ -1,0 +1,88 @@
+"""Reads traces: what is inside an equation, where it was written, and how it is run again."""
+
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.extend import core
+
+# Primitives that only call one jaxpr: their body can be run in place.
+CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
+CALLS |= {"checkpoint": "jaxpr", "remat2": "jaxpr", "remat": "jaxpr"}
+CUSTOM_DERIVATIVES = ("custom_jvp_call", "custom_vjp_call")
+CALLS |= dict.fromkeys(CUSTOM_DERIVATIVES, "call_jaxpr")
+
+
+def called_jaxpr(eqn: core.JaxprEqn) -> core.ClosedJaxpr:
+    """Returns the trace that an equation of `CALLS` calls."""
+    inner = eqn.params[CALLS[eqn.primitive.name]]
+    return inner if isinstance(inner, core.ClosedJaxpr) else core.ClosedJaxpr(inner, ())
+
+
+def sub_jaxprs(eqn: core.JaxprEqn) -> list[core.ClosedJaxpr]:
+    """Returns the traces inside one equation (loop bodies, branches, called functions)."""
+    found = []
+    for value in eqn.params.values():
+        for item in value if isinstance(value, tuple | list) else (value,):
+            if isinstance(item, core.ClosedJaxpr):
+                found.append(item)
+            elif isinstance(item, core.Jaxpr):
+                found.append(core.ClosedJaxpr(item, ()))
+    return found
+
+
+def equations(closed: core.ClosedJaxpr) -> Iterator[core.JaxprEqn]:
+    """Yields all equations of a trace, at any depth, each before those inside of it."""
+    for eqn in closed.jaxpr.eqns:
+        yield eqn
+        for sub in sub_jaxprs(eqn):
+            yield from equations(sub)
+
+
+def source(eqn: core.JaxprEqn) -> str:
+    """Returns the file and line that traced an equation, outside of JAX itself."""
+    traceback = eqn.source_info.traceback
+    frames = traceback.frames if traceback else []
+    own = [f for f in frames if "/jax/_src/" not in f.file_name] or frames
+    return f"{own[0].file_name}:{own[0].line_num}" if own else "an unknown line"
+
+
+def bind_equation(eqn: core.JaxprEqn, *inputs: Any) -> list:
+    """Runs one equation as it is."""
+    with eqn.ctx.manager:
+        outputs = eqn.primitive.bind(*inputs, **eqn.primitive.get_bind_params(eqn.params))
+    return list(outputs) if eqn.primitive.multiple_results else [outputs]
+
+
+def with_own_derivative(eqn: core.JaxprEqn, compute: Callable, inputs: Sequence[Any]) -> list:
+    """Returns `compute(*inputs)`, or the equation itself when that is being differentiated."""
+    computed = jax.custom_jvp(compute)
+    computed.defjvp(functools.partial(jax.jvp, functools.partial(bind_equation, eqn)))
+    return computed(*inputs)
+
+
+def evaluate(
+    closed: core.ClosedJaxpr, apply: Callable[..., list], constant: Callable, *args: Any
+) -> list:
+    """Runs a trace on values of any kind.
+
+    Args:
+      closed: the trace.
+      apply: (equation, *inputs) -> outputs.
+      constant: (array, dtype) -> the value that stands for it.
+      *args: the arguments.
+    """
+    values: dict[Any, Any] = {}
+
+    def read(atom: Any) -> Any:
+        literal = isinstance(atom, core.Literal)
+        return constant(atom.val, atom.aval.dtype) if literal else values[atom]
+
+    consts = [constant(x, jnp.result_type(x)) for x in closed.consts]
+    values.update(zip(closed.jaxpr.constvars, consts, strict=True))
+    values.update(zip(closed.jaxpr.invars, args, strict=True))
+    for eqn in closed.jaxpr.eqns:
+        values.update(zip(eqn.outvars, apply(eqn, *map(read, eqn.invars)), strict=True))
+    return [read(v) for v in closed.jaxpr.outvars]
