@@ -36,13 +36,14 @@ from envs import brax_env
 from experiments import brax_network
 from experiments.benchmark import Part, measure
 from experiments.peers import Ours
-from purerl.core.errors import leave, output_file
 from purerl.core.records import Array, PyTree
 from purerl.devices import compilation
 from purerl.exact import xla_flags
 from purerl.ppo.config import Config
 from purerl.runs import build_experiment
+from purerl.runs.command_errors import leave
 from purerl.runs.experiment import Evaluation, Experiment
+from purerl.runs.files import output_file
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from purerl.core.errors import UserError, leave, tell
+from purerl.core.errors import UserError
+from purerl.runs.command_errors import leave, tell
 
 
 @dataclass(frozen=True)

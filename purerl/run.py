@@ -23,9 +23,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from purerl.core.errors import USAGE, RunError, StoppedError, UserError, leave, tell
+from purerl.core.errors import USAGE, RunError, StoppedError, UserError
 from purerl.exact import xla_flags
 from purerl.runs import experiment
+from purerl.runs.command_errors import leave, tell
 from purerl.runs.experiment import Experiment, Source
 
 

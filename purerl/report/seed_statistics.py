@@ -5,19 +5,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from purerl.core.errors import UserError, unknown
+from purerl.core.errors import UserError, unknown_name
 from purerl.report import bootstrap
-from purerl.report.bit_diff import identity
+from purerl.report.bit_diff import configuration_and_seed
 from purerl.report.bootstrap import Interval
-from purerl.report.run_reader import History
+from purerl.report.run_reader import RunRecord
 
 
 class Group(NamedTuple):
     """Runs that differ in nothing but their seed, or in what the grouping leaves aside."""
 
     label: str
-    runs: list[History]  # each seed of a configuration once
-    strata: dict[str, list[History]]  # what the grouping leaves aside -> its runs
+    runs: list[RunRecord]  # each seed of a configuration once
+    strata: dict[str, list[RunRecord]]  # what the grouping leaves aside -> its runs
 
 
 class Summary(NamedTuple):
@@ -61,12 +61,12 @@ class Curve(NamedTuple):
     runs: list[dict[int, float]]
 
 
-def all_settings(run: History) -> dict[str, Any]:
+def all_settings(run: RunRecord) -> dict[str, Any]:
     """Returns what runs can be grouped by."""
     return {"experiment": run.experiment} | run.settings
 
 
-def differing(runs: Sequence[History]) -> dict[str, list[Any]]:
+def differing(runs: Sequence[RunRecord]) -> dict[str, list[Any]]:
     """Returns the settings in which the runs differ, each with its values."""
     settings = [all_settings(run) for run in runs]
     names = list(dict.fromkeys(name for s in settings for name in s))
@@ -74,7 +74,7 @@ def differing(runs: Sequence[History]) -> dict[str, list[Any]]:
     return {name: list(found.values()) for name, found in values.items() if len(found) > 1}
 
 
-def make_groups(runs: Sequence[History], group_by: Sequence[str]) -> list[Group]:
+def make_groups(runs: Sequence[RunRecord], group_by: Sequence[str]) -> list[Group]:
     """Groups runs by the settings named, or by all in which they differ (but the seed).
 
     Raises:
@@ -84,17 +84,17 @@ def make_groups(runs: Sequence[History], group_by: Sequence[str]) -> list[Group]
     by = [name.replace("-", "_") for name in group_by] or list(differing(runs))
     for name in by:
         if name not in valid:
-            raise unknown("setting", name, valid, " to group by")
-    members: dict[str, dict[str, History]] = {}
+            raise UserError(unknown_name("setting", name, sorted(valid), " to group by"))
+    members: dict[str, dict[str, RunRecord]] = {}
     for run in runs:
-        members.setdefault(label_of(run, by), {}).setdefault(identity(run), run)
+        members.setdefault(label_of(run, by), {}).setdefault(configuration_and_seed(run), run)
     return [
         Group(label, list(found.values()), strata_of(list(found.values()), by))
         for label, found in members.items()
     ]
 
 
-def label_of(run: History, by: Sequence[str]) -> str:
+def label_of(run: RunRecord, by: Sequence[str]) -> str:
     """Returns a group's name: the experiment, and the settings that make the difference."""
     settings = all_settings(run)
     words = [f"{name}={settings.get(name)}" for name in by if name != "experiment"]
@@ -102,9 +102,9 @@ def label_of(run: History, by: Sequence[str]) -> str:
     return " ".join([run.experiment, *words] if named else words)
 
 
-def strata_of(runs: Sequence[History], by: Sequence[str]) -> dict[str, list[History]]:
+def strata_of(runs: Sequence[RunRecord], by: Sequence[str]) -> dict[str, list[RunRecord]]:
     """Sorts a group's runs by the settings that the grouping leaves aside."""
-    strata: dict[str, list[History]] = {}
+    strata: dict[str, list[RunRecord]] = {}
     for run in runs:
         rest = {k: v for k, v in all_settings(run).items() if k not in by}
         strata.setdefault(repr(sorted(rest.items())), []).append(run)
@@ -114,13 +114,13 @@ def strata_of(runs: Sequence[History], by: Sequence[str]) -> dict[str, list[Hist
 # --- scores ---
 
 
-def score(run: History, metric: str) -> float | None:
+def score(run: RunRecord, metric: str) -> float | None:
     """Returns a run's last value of the metric; None if it does not count."""
     curve = run.curve(metric)
     return curve[max(curve)] if curve and run.status != "unfinished" else None
 
 
-def by_seed(runs: Sequence[History], metric: str) -> dict[int, float]:
+def by_seed(runs: Sequence[RunRecord], metric: str) -> dict[int, float]:
     """Returns seed -> score of the runs of a stratum that count; it has each seed once."""
     return {run.seed: s for run in runs if (s := score(run, metric)) is not None}
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import jax
 
+from purerl.core.records import PyTree
 from purerl.runs.build_experiment import Setup
 from purerl.runs.loggers import Record
 from purerl.runs.loop import Plan
-from purerl.core.records import PyTree
 
 SECONDS_BETWEEN_LINES = 2.0
 # Or one would think that it hangs.

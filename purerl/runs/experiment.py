@@ -21,8 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 import tyro
 
 import purerl
-
-from purerl.core.errors import UserError, one_line, unknown
+from purerl.core.errors import UserError, one_line, unknown_name
 
 if TYPE_CHECKING:
     from purerl.ppo.config import Config
@@ -120,7 +119,8 @@ def find(name: str) -> Source:
         return load(named[name])
     if "." in name:
         return _from_module(name)
-    raise unknown("experiment", name, named, f" in {' or '.join(map(str, folders())) or 'sight'}")
+    places = f" in {' or '.join(map(str, folders())) or 'sight'}"
+    raise UserError(unknown_name("experiment", name, named, places))
 
 
 def load(path: Path, name: str = "", copy_of: Path | None = None) -> Source:
@@ -185,7 +185,7 @@ def _from_module(name: str) -> Source:
     except (ImportError, ValueError):
         spec = None
     if spec is None or spec.origin is None:
-        raise unknown("experiment", name, available())
+        raise UserError(unknown_name("experiment", name, available()))
     path = Path(spec.origin)
     with _mistakes(spec.origin, path):
         module = importlib.import_module(name)
@@ -282,4 +282,5 @@ def _check_names(names: list[str], values: Any, path: str) -> None:
         if name not in values:
             raise UserError(f"config.json lacks {_join(path, name)}, which the experiment has.")
         if name not in names:
-            raise unknown("setting", _join(path, name), [_join(path, n) for n in names])
+            valid = [_join(path, n) for n in names]
+            raise UserError(unknown_name("setting", _join(path, name), valid))

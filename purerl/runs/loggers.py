@@ -18,6 +18,7 @@ from purerl.core.errors import UserError, one_line
 Record = dict[str, Any]
 Say = Callable[[str], None]
 
+MAX_SKIPPED_IN_A_ROW = 10  # minibatches; a run that skips so many cannot go on
 COUNTS = ("episodes", "nonfinite_resets", "replayed_resets", "reused_resets", "skipped_minibatches")
 
 

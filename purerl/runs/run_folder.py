@@ -2,7 +2,6 @@
 
 import contextlib
 import fcntl
-import json
 import os
 import shutil
 import uuid
@@ -10,15 +9,15 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-from purerl.runs import checkpoint
-from purerl.devices import compilation
-from purerl.runs import experiment
-from purerl.runs import manifest
-from purerl.runs.build_experiment import Setup, build, physics_hash
-from purerl.core.errors import UserError, one_line
-from purerl.runs.experiment import Experiment, Source
-from purerl.runs.loggers import Say
+from purerl.core.errors import UserError
 from purerl.core.records import TrainState
+from purerl.devices import compilation
+from purerl.runs import checkpoint, checkpoint_folder, experiment, manifest
+from purerl.runs.build_experiment import Setup, build, physics_hash
+from purerl.runs.experiment import Experiment, Source
+from purerl.runs.files import draft_of, read_json, runs_in, write_json
+from purerl.runs.loggers import Say
+from purerl.runs.source_hashes import module_file, source_hashes
 
 LOCK = ".lock"
 OURS = {LOCK, "config.json", "manifest.json", "experiment.py", "metrics.jsonl", "checkpoints"}
@@ -78,7 +77,7 @@ def check_new_or_resume(folders: Iterable[Path], resume: bool) -> None:
         if is_run and not resume:
             raise UserError(f"The run {folder} exists; use --resume to go on, or another --name.")
         strange = {path.name for path in folder.iterdir()} - OURS if folder.is_dir() else set()
-        strange -= {_draft(folder / name).name for name in OURS}  # of a run killed while starting
+        strange -= {draft_of(folder / name).name for name in OURS}  # of a run killed while starting
         if strange and not is_run:
             raise UserError(f"{folder} is no run (it holds {min(strange)}); use another --name.")
 
@@ -128,7 +127,7 @@ def accept_changes(
     """
     old = read_json(folder / "manifest.json")
     known = {"run_id": old.get("run_id", ""), "name": old.get("name", folder.name)}
-    after = max(checkpoint.updates(folder / "checkpoints"), default=0)
+    after = max(checkpoint_folder.updates(folder / "checkpoints"), default=0)
     entry: dict[str, Any] = {"after_update": after, "changes": found}
     if known["name"] != folder.name:
         entry, known = {"of": known} | entry, identity(folder)
@@ -178,15 +177,6 @@ def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> Run:
     return Run(chosen, setup, _choose(folder / "checkpoints", update, abstract, say), settings)
 
 
-def runs_in(place: Path) -> list[Path]:
-    """Returns a run, or the runs in a folder or its folders; [] if there is none."""
-    for pattern in ("config.json", "*/config.json", "*/*/config.json"):
-        runs = sorted(file.parent for file in place.glob(pattern))
-        if runs:
-            return runs
-    return []
-
-
 def changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[str]:
     """Lists what a policy's doings depend on and is not as it was when the run began.
 
@@ -196,10 +186,10 @@ def changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[s
       setup: what it builds now.
     """
     builders = (source.experiment.build_env, source.experiment.build_network)
-    then, now = begun.get("source"), manifest.source_hashes(builders)
+    then, now = begun.get("source"), source_hashes(builders)
     then = then if isinstance(then, dict) else {}
     edited = [name for name, value in now.items() if then.get(name) != value]
-    edited = [name for name in edited if manifest.module_file(name) != source.path]
+    edited = [name for name in edited if module_file(name) != source.path]
     few = ", ".join(edited[:3]) + (f" and {len(edited) - 3} more" if len(edited) > 3 else "")
     found = [f"The code of {few}"] if edited else []
     model = physics_hash(setup.env)
@@ -218,41 +208,19 @@ def fill(old: Any, new: Any, say: Say, path: str = "") -> Any:
 
 
 def _choose(folder: Path, update: str, abstract: TrainState, say: Say) -> checkpoint.Saved:
-    found = checkpoint.updates(folder)
+    found = checkpoint_folder.updates(folder)
     if update == "latest":
-        saved = checkpoint.newest(folder, abstract, say, set_aside=False)
+        saved = checkpoint.newest(folder, abstract, say, rename=False)
         if saved is None:
             raise UserError(f"{folder.parent} has no whole checkpoint yet.")
         return saved
-    number = checkpoint.best_update(folder) if update == "best" else update
+    number = checkpoint_folder.best_update(folder) if update == "best" else update
     if number is None:
         raise UserError(f"No checkpoint in {folder} was taken at an evaluation; try latest.")
     if str(number) not in map(str, found):
         valid = ", ".join(["latest", "best", *map(str, found)])
         raise UserError(f"There is no checkpoint {update!r} in {folder}. Valid: {valid}.")
     try:
-        return checkpoint.load(folder / f"{int(number):012d}", abstract)
-    except checkpoint.DamagedError as error:
+        return checkpoint.load(checkpoint_folder.path_of(folder, int(number)), abstract)
+    except checkpoint_folder.DamagedError as error:
         raise UserError(f"The checkpoint of update {number} is damaged: {error}.") from error
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Reads a JSON file of the run; UserError if it is missing or broken."""
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read: {one_line(error)}") from error
-
-
-def _draft(path: Path) -> Path:
-    return path.with_name(f".{path.name}.draft")
-
-
-def write_json(path: Path, value: dict[str, Any]) -> None:
-    """Writes a JSON file whole or not at all."""
-    draft = _draft(path)
-    try:
-        draft.write_text(json.dumps(value, indent=2) + "\n")
-        draft.replace(path)
-    except OSError as error:
-        raise UserError(f"{path} cannot be written: {error.strerror}.") from error

@@ -14,24 +14,26 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 
-from purerl.runs import build_experiment
-from purerl.runs import checkpoint
-from purerl.devices import compilation
-from purerl.runs import console
-from purerl.devices import processes
-from purerl.exact import xla_flags
-from purerl.runs import manifest
-from purerl.ppo import algorithm
-from purerl.runs import run_folder
-from purerl.devices import multi_device
-from purerl.runs import loop
-from purerl.ppo.config import Config
-from purerl.devices.processes import alone
 from purerl.core.errors import RunError, UserError
-from purerl.runs.experiment import Evaluation, Experiment, Source
-from purerl.runs.seed_group import needed_loggers, train_together
-from purerl.devices.shards import Shards, check_sizes
 from purerl.core.records import PyTree
+from purerl.devices import compilation, multi_device, processes
+from purerl.devices.processes import alone
+from purerl.devices.shards import Shards, check_sizes
+from purerl.exact import xla_flags
+from purerl.ppo import algorithm
+from purerl.ppo.config import Config
+from purerl.runs import (
+    build_experiment,
+    checkpoint,
+    checkpoint_folder,
+    console,
+    loop,
+    manifest,
+    run_folder,
+)
+from purerl.runs.experiment import Evaluation, Experiment, Source
+from purerl.runs.files import read_json
+from purerl.runs.seed_group import needed_loggers, train_together
 
 if TYPE_CHECKING:
     from purerl.run import Options
@@ -77,7 +79,7 @@ def execute(
             begin_or_go_on(folder, source, settings, facts, abstract, options.allow_changes)
         lines = console.describe_plan(plan, setup, abstract, facts, list(runs), cache)
         print("\n".join(lines), flush=True)
-        return not all(checkpoint.updates(folder / "checkpoints") for folder in runs)
+        return not all(checkpoint_folder.updates(folder / "checkpoints") for folder in runs)
 
     with run_folder.refusals():
         fresh = alone(prepare)
@@ -134,7 +136,7 @@ def compile_programs(
 def shards_on_disk(folders: Iterable[Path]) -> int:
     """Returns how many shards a run was begun with, 0 if there is none yet."""
     begun = [folder for folder in folders if (folder / "config.json").exists()]
-    return run_folder.read_json(begun[0] / "manifest.json").get("num_shards", 1) if begun else 0
+    return read_json(begun[0] / "manifest.json").get("num_shards", 1) if begun else 0
 
 
 def choose_shards(config: Config, abstract: PyTree, options: "Options", begun_with: int) -> Shards:
