@@ -115,17 +115,12 @@ def planned_updates(ppo: dict[str, Any]) -> int | None:
         return None
 
 
-def metric_names(runs: Sequence[RunRecord]) -> list[str]:
-    """Returns the metrics that any of the runs has."""
-    own = {"update", "steps", "wall_s", "digest"}
-    return sorted({name for run in runs for line in run.lines for name in line} - own)
-
-
 def check_metric(runs: Sequence[RunRecord], metric: str) -> None:
     """Raises UserError unless some run has the metric."""
-    names = metric_names(runs)
+    names = {name for run in runs for line in run.lines for name in line}
+    names -= {"update", "steps", "wall_s", "digest"}
     if metric not in names:
-        raise UserError(unknown_name("metric", metric, names, " in these runs"))
+        raise UserError(unknown_name("metric", metric, sorted(names), " in these runs"))
 
 
 def _read_lines(path: Path) -> list[dict[str, Any]]:

@@ -20,18 +20,8 @@ import numpy as np
 
 from purerl.core.errors import UserError, one_line
 from purerl.core.records import PyTree, is_key
-from purerl.runs import array_files
-from purerl.runs.checkpoint_folder import (
-    DamagedError,
-    clean,
-    common_updates,
-    discard,
-    hash_meta,
-    load_meta,
-    path_of,
-    set_aside,
-    updates,
-)
+from purerl.runs import array_files, checkpoint_folder
+from purerl.runs.checkpoint_folder import DamagedError, load_meta, path_of
 from purerl.runs.state_arrays import Leaves, digest_leaves, leaf_paths, unflatten
 
 
@@ -40,7 +30,6 @@ class Saved(NamedTuple):
 
     state: PyTree
     meta: dict[str, Any]  # update, steps, digest, and what else `save` was given
-    path: Path
 
 
 def save(folder: Path, leaves: Leaves, meta: dict[str, Any]) -> Path:
@@ -56,14 +45,14 @@ def save(folder: Path, leaves: Leaves, meta: dict[str, Any]) -> Path:
     """
     meta = meta | {"leaves": {path: _describe(array) for path, array in leaves.items()}}
     path = path_of(folder, meta["update"])
-    discard(path)
+    checkpoint_folder.discard(path)
     stored = {key: array for key, array in leaves.items() if array.size}
     try:
-        array_files.write(path, stored, meta | {"meta_sha256": hash_meta(meta)})
+        array_files.write(path, stored, meta | {"meta_sha256": checkpoint_folder.hash_meta(meta)})
         array_files.flush(path)
     except BaseException:
-        discard(path)
-        clean(folder)
+        checkpoint_folder.discard(path)
+        checkpoint_folder.clean(folder)
         raise
     return path
 
@@ -96,24 +85,16 @@ def load(path: Path, abstract: PyTree) -> Saved:
             )
     if digest_leaves(leaves) != meta["digest"]:
         raise DamagedError("the digest of all leaves differs from the one written with them")
-    return Saved(unflatten(leaves, abstract), meta, path)
+    return Saved(unflatten(leaves, abstract), meta)
 
 
 def newest(
-    folder: Path, abstract: PyTree, say: Callable[[str], None], rename: bool = True
-) -> Saved | None:
-    """Reads the newest whole checkpoint of one run; None without any. See `newest_of_all`."""
-    found = newest_of_all([folder], abstract, say, rename)
-    return found[0] if found else None
-
-
-def newest_of_all(
     folders: Sequence[Path], abstract: PyTree, say: Callable[[str], None], rename: bool = True
 ) -> list[Saved]:
     """Reads the newest update that all folders hold whole.
 
     Args:
-      folders: the checkpoints of seeds that train together.
+      folders: the checkpoints of a run, or of each of the seeds that train together.
       abstract: shapes of one seed's state.
       say: told of each damaged checkpoint.
       rename: whether to rename damaged ones to `damaged-<n>-<update>`; False where another process
@@ -122,14 +103,14 @@ def newest_of_all(
     Returns:
       One checkpoint for each folder; [] if there is no such update.
     """
-    for update in reversed(common_updates(folders)):
+    for update in reversed(checkpoint_folder.common_updates(folders)):
         found = []
         for folder in folders:
             path = path_of(folder, update)
             try:
                 found.append(load(path, abstract))
             except DamagedError as error:
-                kept = set_aside(path) if rename else path
+                kept = checkpoint_folder.set_aside(path) if rename else path
                 say(f"Checkpoint of update {update} is damaged: {error}. It is kept as {kept}; "
                     "the one before it is taken, if there is one.")  # fmt: skip
         if len(found) == len(folders):
@@ -139,7 +120,7 @@ def newest_of_all(
 
 def check_fits(folder: Path, abstract: PyTree) -> None:
     """Raises UserError if the newest checkpoint is of another state; reads no array."""
-    for update in reversed(updates(folder)):
+    for update in reversed(checkpoint_folder.updates(folder)):
         path = path_of(folder, update)
         with contextlib.suppress(DamagedError):
             _check_fits(path, load_meta(path), abstract)

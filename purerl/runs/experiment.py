@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import tyro
 
-import purerl
 from purerl.core.errors import UserError, one_line, unknown_name
 
 if TYPE_CHECKING:
@@ -84,7 +83,7 @@ class Source(NamedTuple):
 
 def folders() -> list[Path]:
     """Returns where named experiments are looked for: here, then beside the library."""
-    places = [Path.cwd() / "experiments", Path(purerl.__file__).parent.parent / "experiments"]
+    places = [Path.cwd() / "experiments", Path(__file__).parents[2] / "experiments"]
     return [place for place in dict.fromkeys(places) if place.is_dir()]
 
 

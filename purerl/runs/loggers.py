@@ -11,7 +11,7 @@ import queue
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from purerl.core.errors import UserError, one_line
 
@@ -46,11 +46,6 @@ def summarize(window: Sequence[Mapping[str, Any]]) -> Record:
     return record
 
 
-def finite_or_none(value: Any) -> Any:
-    """Returns NaN and infinities as None: JSON has no such numbers."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 class MetricsFile:
     """metrics.jsonl: whole lines, appended and flushed, cut back to where a checkpoint was taken.
 
@@ -72,8 +67,9 @@ class MetricsFile:
 
     def append(self, record: Record) -> int:
         """Writes one line; returns the file's length after it [bytes]. OSError: not written yet."""
-        clean = {name: finite_or_none(value) for name, value in record.items()}
-        self.pending += json.dumps(clean, allow_nan=False).encode() + b"\n"
+        # JSON has no NaN and no infinity.
+        odd = {k: None for k, v in record.items() if isinstance(v, float) and not math.isfinite(v)}
+        self.pending += json.dumps(record | odd, allow_nan=False).encode() + b"\n"
         try:
             written = self.file.write(self.pending)
             if written != len(self.pending):
@@ -90,22 +86,13 @@ class MetricsFile:
         self.file.close()
 
 
-class Sink(Protocol):
-    """Where a logger's records go."""
-
-    def log(self, record: Record) -> None:
-        """Takes one record."""
-        ...
-
-    def close(self) -> None:
-        """Flushes."""
-        ...
-
-
 class BackgroundLogger:
-    """A sink in a thread of its own; dropped, with one message, when it raises or lags."""
+    """A sink in a thread of its own; dropped, with one message, when it raises or lags.
 
-    def __init__(self, name: str, open_sink: Callable[[], Sink], say: Say, size: int = 256) -> None:
+    A sink is what has `log(record)` and `close()`.
+    """
+
+    def __init__(self, name: str, open_sink: Callable[[], Any], say: Say, size: int = 256) -> None:
         """Opens the sink in the thread; `size` records may wait before it counts as too slow."""
         self.name, self.say = name, say
         self.queue: queue.Queue[Record | None] = queue.Queue(size)
@@ -135,7 +122,7 @@ class BackgroundLogger:
         if self.thread.is_alive():
             self._drop(f"it did not finish within {timeout:g} s")
 
-    def _work(self, open_sink: Callable[[], Sink]) -> None:
+    def _work(self, open_sink: Callable[[], Any]) -> None:
         try:
             sink = open_sink()
             while (record := self.queue.get()) is not None and not self.dropped.is_set():

@@ -33,18 +33,15 @@ def collect(
 
     Args:
       engine: the physics engine in use, resolved ("auto" is not an answer).
-      builders: functions whose source folders are part of the run (build_env, build_network).
-      kernels: `kernels.how_chosen`.
-      num_shards: V; on how many devices share them the bits do not depend.
+      builders: functions whose source is part of the run (build_env, build_network).
+      kernels: `xla_flags.how_chosen`.
+      num_shards: V. How many devices share the shards changes no bit.
     """
     import jax
 
     packages = PACKAGES + (["warp-lang"] if engine == "warp" else [])
     device = jax.devices()[0]
-    about = {
-        "platform": device.platform,
-        "kind": _device_kind(device),
-    }
+    about = {"platform": device.platform, "kind": _device_kind(device)}
     if device.platform == "cpu":  # XLA's pool size changes the bits of matrix products on a CPU
         about["threads"] = max(cpu_threads(), jax.local_device_count())
     options = jax.config.values
@@ -73,7 +70,7 @@ def inexact_because(engine: str, kernels: str, unordered: Iterable[str] = ()) ->
 
     Args:
       engine: the physics engine.
-      kernels: `kernels.how_chosen`.
+      kernels: `xla_flags.how_chosen`.
       unordered: places of sums, in a program for a GPU, whose order nothing fixes.
     """
     reasons = [f"a sum without a fixed order: {place}" for place in unordered]
@@ -149,18 +146,11 @@ def _device_kind(device: Any) -> str:
 
 def _git(folder: Path) -> dict[str, Any]:
     """Returns the revision of the checkout that `folder` is in, None outside of one."""
-
-    def ask(*words: str) -> str | None:
-        try:
-            done = subprocess.run(
-                ["git", "-C", str(folder), *words], capture_output=True, text=True, timeout=10
-            )
-        except (OSError, subprocess.TimeoutExpired):
-            return None
-        return done.stdout.strip() if done.returncode == 0 else None
-
-    status = ask("status", "--porcelain", "--untracked-files=no")
-    return {
-        "git_revision": ask("rev-parse", "HEAD"),
-        "git_dirty": None if status is None else bool(status),
-    }
+    words = ["git", "-C", str(folder), "describe", "--always", "--abbrev=40", "--exclude=*"]
+    try:
+        done = subprocess.run([*words, "--dirty"], capture_output=True, text=True, timeout=10)
+        said = done.stdout.strip()
+    except (OSError, subprocess.TimeoutExpired):
+        said = ""
+    revision = said.removesuffix("-dirty")
+    return {"git_revision": revision or None, "git_dirty": revision != said if said else None}

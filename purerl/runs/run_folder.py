@@ -23,7 +23,7 @@ LOCK = ".lock"
 OURS = {LOCK, "config.json", "manifest.json", "experiment.py", "metrics.jsonl", "checkpoints"}
 
 
-class Run(NamedTuple):
+class RestoredRun(NamedTuple):
     """A run read back from its folder alone."""
 
     experiment: Experiment
@@ -143,7 +143,7 @@ def amend(folder: Path, facts: dict[str, Any]) -> None:
     write_json(path, read_json(path) | facts)
 
 
-def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> Run:
+def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> RestoredRun:
     """Rebuilds a run from its folder alone, to see what its policy does; changes nothing in it.
 
     The state comes without `env`, `episode` and `optimizer`: a policy needs none of them, and on
@@ -174,7 +174,8 @@ def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> Run:
         say(f"{what} is not that of the run any more.")
     abstract = compilation.abstract_state(*setup[:3])
     abstract = abstract.replace(env=None, episode=None, optimizer=None)
-    return Run(chosen, setup, _choose(folder / "checkpoints", update, abstract, say), settings)
+    saved = _choose(folder / "checkpoints", update, abstract, say)
+    return RestoredRun(chosen, setup, saved, settings)
 
 
 def changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[str]:
@@ -210,10 +211,10 @@ def fill(old: Any, new: Any, say: Say, path: str = "") -> Any:
 def _choose(folder: Path, update: str, abstract: TrainState, say: Say) -> checkpoint.Saved:
     found = checkpoint_folder.updates(folder)
     if update == "latest":
-        saved = checkpoint.newest(folder, abstract, say, rename=False)
-        if saved is None:
+        whole = checkpoint.newest([folder], abstract, say, rename=False)
+        if not whole:
             raise UserError(f"{folder.parent} has no whole checkpoint yet.")
-        return saved
+        return whole[0]
     number = checkpoint_folder.best_update(folder) if update == "best" else update
     if number is None:
         raise UserError(f"No checkpoint in {folder} was taken at an evaluation; try latest.")

@@ -88,7 +88,7 @@ def find_saved(
     places: list[Path], abstract: PyTree, resume: bool, say: Say
 ) -> list[checkpoint.Saved]:
     """Returns the newest checkpoint that all `places` have, one each; [] if there is none yet."""
-    saved = checkpoint.newest_of_all(places, abstract, say)
+    saved = checkpoint.newest(places, abstract, say)
     if not saved:
         checkpoint_folder.check_none_lost(places)
         if resume:

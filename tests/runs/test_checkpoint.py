@@ -137,7 +137,7 @@ def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_used(tmp_path, dam
     save(tmp_path, 1)
     damage(save(tmp_path, 2))
     said = []
-    saved = checkpoint.newest(tmp_path, abstract(), said.append)
+    (saved,) = checkpoint.newest([tmp_path], abstract(), said.append)
     assert saved.meta["update"] == 1
     assert state_arrays.digest(saved.state) == state_arrays.digest(make_state(1.0))
     assert len(said) == 1 and "update 2" in said[0] and "damaged-0-000000000002" in said[0]
@@ -147,7 +147,7 @@ def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_used(tmp_path, dam
 
 def test_a_reader_sets_nothing_aside(tmp_path):
     damage_cut(save(tmp_path, 2))
-    assert checkpoint.newest(tmp_path, abstract(), lambda line: None, rename=False) is None
+    assert checkpoint.newest([tmp_path], abstract(), print, rename=False) == []
     assert checkpoint_folder.updates(tmp_path) == [2]
 
 
@@ -178,12 +178,12 @@ def test_of_seeds_together_those_are_kept_that_all_have(tmp_path):
     assert checkpoint_folder.updates(ahead) == [2, 3, 4] and checkpoint_folder.updates(behind) == [
         2
     ]
-    found = checkpoint.newest_of_all([ahead, behind], abstract(), print)
+    found = checkpoint.newest([ahead, behind], abstract(), print)
     assert [saved.meta["update"] for saved in found] == [2, 2]
     checkpoint_folder.forget_after(ahead, 2)
     assert checkpoint_folder.updates(ahead) == [2]
     damage_cut(behind / f"{2:012d}")
-    assert checkpoint.newest_of_all([ahead, behind], abstract(), print) == []
+    assert checkpoint.newest([ahead, behind], abstract(), print) == []
     assert checkpoint_folder.updates(ahead) == [2]
 
 
