@@ -32,7 +32,7 @@ def repeats(runs: Iterable[RunRecord]) -> list[tuple[RunRecord, RunRecord]]:
 
 def configuration_and_seed(run: RunRecord) -> str:
     """Returns all of a run's settings that its bits depend on, as text."""
-    return repr((run.experiment, run.seed, sorted(run.settings.items(), key=str)))
+    return repr((run.seed, sorted(run.settings.items(), key=str)))
 
 
 def compare_bits(a: RunRecord, b: RunRecord) -> BitDiff:

@@ -1,4 +1,4 @@
-"""Runs read back to be compared: what was set, what was measured, how far each came."""
+"""Reads runs back from their folders: settings, metrics, and how far each run came."""
 
 import glob
 import json
@@ -19,9 +19,8 @@ class RunRecord(NamedTuple):
     """One run's folder, read."""
 
     path: Path
-    experiment: str
     seed: int
-    settings: dict[str, Any]  # "ppo.learning_rate" -> value; without NOT_LEARNING
+    settings: dict[str, Any]  # "experiment", "ppo.learning_rate", ...; without NOT_LEARNING
     manifest: dict[str, Any]
     source: bytes  # of experiment.py
     lines: list[dict[str, Any]]  # of metrics.jsonl
@@ -81,13 +80,12 @@ def read(path: Path) -> RunRecord:
     """Reads one run's folder."""
     config = read_json(path / "config.json")
     try:
-        settings, experiment = config["settings"], config["experiment"]
+        settings = config["settings"]
         learning = {k: v for k, v in settings.items() if k not in NOT_LEARNING}
         return RunRecord(
             path=path,
-            experiment=experiment,
             seed=settings["seed"],
-            settings=flatten(learning),
+            settings=flatten({"experiment": config["experiment"]} | learning),
             manifest=read_json(path / "manifest.json"),
             source=(path / "experiment.py").read_bytes(),
             lines=_read_lines(path / "metrics.jsonl"),
@@ -108,7 +106,7 @@ def flatten(value: Any, path: str = "") -> dict[str, Any]:
 
 
 def planned_updates(ppo: dict[str, Any]) -> int | None:
-    """Returns how many updates a run has by its settings; None if they are of another version."""
+    """Returns how many updates a run's settings ask for; None if this version cannot read them."""
     try:
         return Config(**ppo).num_updates
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""Groups of runs: which belong together, what each scored, and how groups stand to each other."""
+"""Groups of runs: which runs belong together, what each group scored, how two groups differ."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -61,14 +61,9 @@ class Curve(NamedTuple):
     runs: list[dict[int, float]]
 
 
-def all_settings(run: RunRecord) -> dict[str, Any]:
-    """Returns what runs can be grouped by."""
-    return {"experiment": run.experiment} | run.settings
-
-
 def differing(runs: Sequence[RunRecord]) -> dict[str, list[Any]]:
     """Returns the settings in which the runs differ, each with its values."""
-    settings = [all_settings(run) for run in runs]
+    settings = [run.settings for run in runs]
     names = list(dict.fromkeys(name for s in settings for name in s))
     values = {n: {repr(s.get(n)): s.get(n) for s in settings} for n in names}
     return {name: list(found.values()) for name, found in values.items() if len(found) > 1}
@@ -80,7 +75,7 @@ def make_groups(runs: Sequence[RunRecord], group_by: Sequence[str]) -> list[Grou
     Raises:
       UserError: there is no such setting.
     """
-    valid = {name for run in runs for name in all_settings(run)}
+    valid = {name for run in runs for name in run.settings}
     by = [name.replace("-", "_") for name in group_by] or list(differing(runs))
     for name in by:
         if name not in valid:
@@ -96,17 +91,16 @@ def make_groups(runs: Sequence[RunRecord], group_by: Sequence[str]) -> list[Grou
 
 def label_of(run: RunRecord, by: Sequence[str]) -> str:
     """Returns a group's name: the experiment, and the settings that make the difference."""
-    settings = all_settings(run)
-    words = [f"{name}={settings.get(name)}" for name in by if name != "experiment"]
+    words = [f"{name}={run.settings.get(name)}" for name in by if name != "experiment"]
     named = "experiment" in by or not words
-    return " ".join([run.experiment, *words] if named else words)
+    return " ".join([run.settings["experiment"], *words] if named else words)
 
 
 def strata_of(runs: Sequence[RunRecord], by: Sequence[str]) -> dict[str, list[RunRecord]]:
     """Sorts a group's runs by the settings that the grouping leaves aside."""
     strata: dict[str, list[RunRecord]] = {}
     for run in runs:
-        rest = {k: v for k, v in all_settings(run).items() if k not in by}
+        rest = {k: v for k, v in run.settings.items() if k not in by}
         strata.setdefault(repr(sorted(rest.items())), []).append(run)
     return dict(sorted(strata.items()))
 
@@ -180,11 +174,14 @@ def versus(group: Group, baseline: Group, metric: str) -> Versus | None:
 
 
 def paired_differences(group: Group, baseline: Group, metric: str) -> list[bootstrap.Values]:
-    """Returns group's score less baseline's on seeds that both have, [n_k] of each shared stratum.
+    """Returns the group's scores minus the baseline's on the seeds that both have.
 
-    A seed makes the same initial weights in networks of one shape, and they decide much: returns of
-    eight seeds of brax's ant under three versions of the learner correlated by 0.71 to 0.84, and
+    Equal seeds give networks of one shape the same initial weights, and these decide much. Returns
+    of eight seeds of brax's ant under three versions of the learner correlated by 0.71 to 0.84, and
     the paired interval was less than half as wide.
+
+    Returns:
+      [n_k] for each stratum that both groups have.
     """
     found = []
     for key in sorted(group.strata.keys() & baseline.strata.keys()):

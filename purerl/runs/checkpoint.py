@@ -70,7 +70,10 @@ def load(path: Path, abstract: PyTree) -> Saved:
     """
     meta = load_meta(path)
     _check_fits(path, meta, abstract)
-    leaves = {key: _blank(about) for key, about in meta["leaves"].items()}
+    leaves = {
+        key: np.zeros(about["shape"], jnp.dtype(about["dtype"]))
+        for key, about in meta["leaves"].items()
+    }
     target = {key: array for key, array in leaves.items() if array.size}
     try:
         leaves |= array_files.read(path, target)
@@ -128,10 +131,6 @@ def check_fits(folder: Path, abstract: PyTree) -> None:
 
 
 # --- parts ---
-
-
-def _blank(about: dict[str, Any]) -> np.ndarray:
-    return np.zeros(about["shape"], jnp.dtype(about["dtype"]))
 
 
 def _describe(array: np.ndarray) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """What a run tells: metrics.jsonl, which is part of the run, and loggers, which are not.
 
-metrics.jsonl is exact: resumed or not, it holds the same lines. TensorBoard and W&B live in
-threads of their own behind bounded queues; one that raises or cannot keep up is dropped, once and
-aloud, and training never waits for it.
+metrics.jsonl is exact: it holds the same lines whether the run was resumed or not. TensorBoard and
+W&B have threads of their own. Training never waits for them: a logger that raises an error, or
+cannot keep up, is dropped with one message.
 """
 
 import json
@@ -23,10 +23,10 @@ COUNTS = ("episodes", "nonfinite_resets", "replayed_resets", "reused_resets", "s
 
 
 def summarize(window: Sequence[Mapping[str, Any]]) -> Record:
-    """Joins the metrics of several updates: counts are summed, the rest averaged.
+    """Joins the metrics of several updates: counts are summed, the rest is averaged.
 
-    What is known of ended episodes (`episode...`) is averaged over episodes, not over updates, and
-    None where none ended.
+    Metrics of episodes that ended (`episode...`) are averaged over the episodes, not over the
+    updates. They are None if no episode ended.
     """
     episodes = sum(float(metrics["episodes"]) for metrics in window)
     record: Record = {}
@@ -47,10 +47,10 @@ def summarize(window: Sequence[Mapping[str, Any]]) -> Record:
 
 
 class MetricsFile:
-    """metrics.jsonl: whole lines, appended and flushed, cut back to where a checkpoint was taken.
+    """metrics.jsonl: whole lines, written at once. A resumed run first cuts it back.
 
-    A line that the disk refuses is kept and written with the next one, so that a disk that was full
-    for a while leaves no gap.
+    A line that the disk refuses is kept and written with the next one. So a disk that was full for
+    a while leaves no gap.
     """
 
     def __init__(self, path: Path, offset: int) -> None:

@@ -33,7 +33,7 @@ class RestoredRun(NamedTuple):
 
 
 def lock(folder: Path) -> IO[str]:
-    """Makes the folder and takes it for this process; released when the process ends, however."""
+    """Makes the folder and locks it for this process, until the process ends in whatever way."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         handle = (folder / LOCK).open("a+")
@@ -56,7 +56,7 @@ def lock(folder: Path) -> IO[str]:
 
 @contextlib.contextmanager
 def refusals() -> Iterator[None]:
-    """Makes one line of a disk that refuses what a run needs before it can begin."""
+    """Turns a disk's refusal to write what a run needs at its beginning into a UserError."""
     try:
         yield
     except OSError as error:
@@ -65,9 +65,11 @@ def refusals() -> Iterator[None]:
 
 
 def check_new_or_resume(folders: Iterable[Path], resume: bool) -> None:
-    """Raises UserError when a folder holds a run and should not, or none of them does and should.
+    """Raises UserError if a new run would overwrite something, or there is nothing to resume.
 
-    A group of seeds that was killed while starting has the folders of some of them.
+    Args:
+      folders: one for each seed. Seeds that were killed while starting may have only some of them.
+      resume: whether the runs are to go on.
     """
     folders = list(folders)
     if resume and not any(folder.exists() for folder in folders):
@@ -110,7 +112,17 @@ def identity(folder: Path) -> dict[str, str]:
 def check_same(
     folder: Path, source: Source, settings: dict[str, Any], facts: dict[str, Any]
 ) -> list[str]:
-    """Lists in what this process differs from the one that began the run; empty: exact resume."""
+    """Lists how this process differs from the one that began the run.
+
+    Args:
+      folder: the run.
+      source: the experiment as it is now.
+      settings: what config.json would say now.
+      facts: what manifest.json would say now.
+
+    Returns:
+      A line for each difference; none: the run goes on exactly.
+    """
     found = manifest.differences(read_json(folder / "config.json"), settings)
     found += manifest.differences(read_json(folder / "manifest.json"), facts)
     if (folder / "experiment.py").read_bytes() != source.path.read_bytes():
@@ -121,9 +133,9 @@ def check_same(
 def accept_changes(
     folder: Path, source: Source, settings: dict[str, Any], facts: dict[str, Any], found: list[str]
 ) -> None:
-    """Writes down that the run goes on under other conditions, after which update, and as what.
+    """Writes down after which update the run goes on under other conditions, and which.
 
-    A copy under another name is a run of its own, which loggers must not take for the first one.
+    A copy under another name gets a run_id of its own: loggers must not take it for the first run.
     """
     old = read_json(folder / "manifest.json")
     known = {"run_id": old.get("run_id", ""), "name": old.get("name", folder.name)}
@@ -179,7 +191,7 @@ def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> Rest
 
 
 def changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[str]:
-    """Lists what a policy's doings depend on and is not as it was when the run began.
+    """Lists what has changed since the run began and may change what its policy does.
 
     Args:
       begun: the run's manifest.json.
@@ -200,7 +212,7 @@ def changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[s
 
 
 def fill(old: Any, new: Any, say: Say, path: str = "") -> Any:
-    """Returns the settings `old` of a run with those of `new` that have come to the code since."""
+    """Returns the settings `old` of a run, and from `new` those that the code got since then."""
     if not (isinstance(old, dict) and isinstance(new, dict)):
         return old
     for name in new.keys() - old.keys():

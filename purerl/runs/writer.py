@@ -1,7 +1,7 @@
 """Writes a run's metrics and checkpoints, in order, from one background thread.
 
 The order matters: a checkpoint says how long metrics.jsonl was when it was taken. One thread keeps
-it without making training wait for hashes or the disk.
+the order, and training does not wait for hashes or the disk.
 """
 
 from collections.abc import Sequence
@@ -52,17 +52,17 @@ class RunWriter:
         self.last_failed = False  # whether the newest attempt to save failed
 
     def write(self, record: Record) -> None:
-        """Appends a line to metrics.jsonl, soon, and hands it to the loggers."""
+        """Hands a line to the loggers, and to the thread that appends it to metrics.jsonl."""
         self._submit(self._write, record)
 
     def save(
         self, record: Record, leaves: state_arrays.Leaves, meta: dict[str, Any], planned: bool
     ) -> None:
-        """Like `write`, then saves a checkpoint; waits only while the one before is being written.
+        """Writes a line and saves a checkpoint; waits only while the last one is being written.
 
         Args:
-          record: the line; it gets the state's digest when the checkpoint is a planned one. (One
-            taken because of a signal must leave no trace in metrics.jsonl.)
+          record: the line. A planned checkpoint adds the state's digest to it. (One that a signal
+            asked for must leave no trace in metrics.jsonl.)
           leaves: `state_arrays.flatten` of the state.
           meta: what the checkpoint should say besides digest and length of metrics.jsonl.
           planned: whether the run would have saved here without being interrupted.

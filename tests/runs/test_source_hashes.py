@@ -100,17 +100,13 @@ def test_an_edited_package_refuses_to_resume_and_names_what_was_edited(copy, tmp
     done = resume(copy, runs)
     assert (done.returncode, done.stderr) == (SUCCESS, "")
     assert "Already done" in done.stdout
-    # Modules that a list of the algorithm's imports would lack: they are on top of it.
-    for name in ("devices/compilation.py", "exact/xla_flags.py", "runs/loop.py"):
-        edit(copy / name)
+    edited = {room: modules(copy / room)[0] for room in ROOMS if room != "report"}
+    for file in edited.values():
+        edit(file)
     done = resume(copy, runs)
     assert done.returncode == USAGE and "begun under other conditions" in done.stderr
     named = [line.split(":")[0].strip() for line in done.stderr.splitlines() if "->" in line]
-    assert named == [
-        "source.purerl.devices.compilation",
-        "source.purerl.exact.xla_flags",
-        "source.purerl.runs.loop",
-    ]
+    assert named == [f"source.purerl.{room}.{file.stem}" for room, file in edited.items()]
 
 
 def test_the_manifest_of_a_run_holds_every_room_that_computes(tmp_path):
