@@ -94,9 +94,16 @@ def _is_within(package: str, folders: set[Path]) -> bool:
 def installed_folders() -> set[Path]:
     """Returns where Python and installed packages are: beside a package there is its metadata."""
     places = {Path(place).absolute() for place in sys.path}
-    places = {place for place in places if os.access(place, os.R_OK | os.X_OK)}
-    holding = {place for place in places if any(place.glob("*.dist-info"))}
-    return holding | {Path(sysconfig.get_path("stdlib"))}
+    return {*filter(_holds_packages, places), Path(sysconfig.get_path("stdlib"))}
+
+
+def _holds_packages(folder: Path) -> bool:
+    try:
+        return any(name.endswith(".dist-info") for name in os.listdir(folder))
+    except PermissionError:  # whatever is in it, it cannot be this process's own source
+        return True
+    except OSError:  # an archive, or nothing
+        return False
 
 
 def module_file(name: str) -> Path | None:

@@ -35,7 +35,7 @@ from purerl.runs import (
 from purerl.runs.experiment import Evaluation, find
 
 TOY = Path(__file__).parent / "toy_experiment.py"
-ROOT = TOY.parent.parent
+ROOT = TOY.parent.parent.parent
 LONG = ["--ppo.num-steps", "6400", "--checkpoints", "20"]  # 200 updates: seconds
 
 
