@@ -14,8 +14,9 @@ from dm_control import mjcf
 
 from envs.arenas import GROUND, Arena, BoxFields, box_fields, build_arena, check_passable
 from envs.bodies import Body
+from purerl.core.errors import unknown_name
 from purerl.physics.interface import choose_engine
-from purerl.physics.lookup import find, unknown_name
+from purerl.physics.lookup import find
 
 PREFIX = "walker/"  # composing puts it before the names of the body's parts
 TORSO_VELOCITY = "torso_velocity"  # a sensor of the walker's centre of mass [m/s]

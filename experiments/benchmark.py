@@ -31,15 +31,16 @@ import jax.numpy as jnp
 
 from experiments import start_up
 from purerl import exact, run
-from purerl.core.errors import leave, output_file
 from purerl.core.records import Array, Network, PyTree, TrainState
 from purerl.physics.lookup import scale_action
 from purerl.ppo import algorithm, learner
 from purerl.ppo.evaluation import evaluate
 from purerl.ppo.rollout import rollout
 from purerl.runs import build_experiment, command_line
+from purerl.runs.command_errors import leave
 from purerl.runs.console import size
 from purerl.runs.experiment import Experiment, find
+from purerl.runs.files import output_file
 
 PARTS = ("physics alone", "rollout", "learner", "update", "evaluation")
 

@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 
 from purerl.core.records import Array, Network, Normal, PolicyOutput
-from purerl.ppo.networks import check_observation, from_linen
+from purerl.ppo.checks import check_observation
+from purerl.ppo.networks import from_linen
 
 MIN_SCALE = 1e-3
 

@@ -37,12 +37,13 @@ from experiments import brax_network
 from experiments.benchmark import Part, measure
 from experiments.peers import Ours
 from purerl import exact
-from purerl.core.errors import leave, output_file
 from purerl.core.records import Array, PyTree
 from purerl.devices import compilation
 from purerl.ppo.config import Config, Evaluation
 from purerl.runs import build_experiment
+from purerl.runs.command_errors import leave
 from purerl.runs.experiment import Experiment
+from purerl.runs.files import output_file
 
 
 @dataclass(frozen=True)

@@ -30,12 +30,14 @@ import numpy as np
 
 from experiments.brax_peer import BODIES, Published, our_experiment, resize, train_brax
 from purerl import exact
-from purerl.core.errors import UserError, leave, output_file
+from purerl.core.errors import UserError
 from purerl.devices import compilation
-from purerl.devices.compilation import Programs
+from purerl.devices.programs import Programs
 from purerl.ppo.config import Evaluation
 from purerl.report import bootstrap
 from purerl.runs import build_experiment
+from purerl.runs.command_errors import leave
+from purerl.runs.files import output_file
 
 NUM_EPISODES = 128
 PHYSICS = {"purerl": "purerl", "purerl-on-brax": "mjx"}  # ours -> whose

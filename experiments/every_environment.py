@@ -16,11 +16,12 @@ import jax
 from envs.suite.tasks import TASKS
 from envs.suite.tasks import Options as SuiteOptions
 from experiments.benchmark import bare_physics, compile_part, measure
-from purerl.core.errors import UserError, leave, one_line
+from purerl.core.errors import UserError, one_line
 from purerl.ppo import algorithm
 from purerl.ppo.rollout import rollout
 from purerl.runs import build_experiment
 from purerl.runs.check_env import check_env
+from purerl.runs.command_errors import leave
 from purerl.runs.experiment import Experiment, find
 
 OURS = ("cartpole_swingup", "ant_run", "ant_gaps", "rodent_run", "rodent_gaps")

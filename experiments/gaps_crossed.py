@@ -15,12 +15,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from purerl.core.errors import UserError, leave
+from purerl.core.errors import UserError
 from purerl.core.keys import Purpose, derive
 from purerl.core.records import Array, Network, Normal, PolicyOutput, TrainState
 from purerl.devices.compilation import set_up_jax
 from purerl.ppo.evaluation import evaluate
 from purerl.runs import build_experiment, run_folder
+from purerl.runs.command_errors import leave
 
 
 def gaps_of(

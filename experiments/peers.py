@@ -30,11 +30,12 @@ import jax
 
 from experiments.benchmark import Part, Timing, measure
 from experiments.gymnasium_ant import experiment
-from purerl.core.errors import leave, output_file
 from purerl.ppo import algorithm
 from purerl.ppo.config import Config
 from purerl.ppo.networks import MlpOptions
 from purerl.runs import build_experiment
+from purerl.runs.command_errors import leave
+from purerl.runs.files import output_file
 
 
 class Sizes(NamedTuple):

@@ -34,13 +34,15 @@ import flax.linen as nn
 import jax
 import numpy as np
 
-from purerl.core.errors import UserError, leave, output_file
+from purerl.core.errors import UserError
 from purerl.core.keys import Purpose, derive
 from purerl.core.records import Array, TrainState
 from purerl.devices.compilation import set_up_jax
 from purerl.ppo.evaluation import Progress, advance, start
 from purerl.ppo.rollout import act
 from purerl.runs import build_experiment, run_folder, state_arrays
+from purerl.runs.command_errors import leave
+from purerl.runs.files import output_file
 
 
 def note_modules(noted: dict[str, Array]) -> Callable[..., Any]:

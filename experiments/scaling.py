@@ -27,10 +27,12 @@ import jax
 
 from experiments.benchmark import compile_part, measure
 from purerl import exact, run
-from purerl.core.errors import UserError, leave, output_file
+from purerl.core.errors import UserError
 from purerl.ppo import algorithm
 from purerl.runs import build_experiment, command_line
+from purerl.runs.command_errors import leave
 from purerl.runs.experiment import Experiment, find
+from purerl.runs.files import output_file
 
 HERE = sorted(os.sched_getaffinity(0))  # cores that this process may use
 AXES: dict[str, tuple[int, ...]] = {

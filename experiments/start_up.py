@@ -17,7 +17,8 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from purerl.core.errors import UserError, leave
+from purerl.core.errors import UserError
+from purerl.runs.command_errors import leave
 
 LIMIT_S = 900.0
 

@@ -3,7 +3,6 @@
 RUN is a run's folder; nothing else is needed, and nothing in it is changed.
 """
 
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +11,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from purerl.core.errors import UserError, leave, tell
+from purerl.core.errors import UserError
+from purerl.runs.command_errors import leave, tell
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,7 @@ def evaluate_run(options: Options) -> dict[str, Any]:
     from purerl.core.keys import Purpose, derive
     from purerl.devices.compilation import set_up_jax
     from purerl.ppo.evaluation import evaluate
+    from purerl.runs.files import write_json
     from purerl.runs.run_folder import restore
 
     if options.episodes < 1:
@@ -85,7 +86,7 @@ def evaluate_run(options: Options) -> dict[str, Any]:
         "metrics": {name: statistics(np.asarray(x, float)) for name, x in sorted(values.items())},
     }
     if options.json is not None:
-        write(options.json, result)
+        write_json(options.json, result)
     return result
 
 
@@ -114,14 +115,6 @@ def describe(result: dict[str, Any]) -> list[str]:
             for name, s in ordered.items()
         ),
     ]
-
-
-def write(path: Path, result: dict[str, Any]) -> None:
-    """Writes the result as JSON."""
-    try:
-        path.write_text(json.dumps(result, indent=2) + "\n")
-    except OSError as error:
-        raise UserError(f"{path} cannot be written: {error.strerror}.") from error
 
 
 if __name__ == "__main__":

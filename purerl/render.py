@@ -14,7 +14,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from purerl.core.errors import RunError, UserError, leave, one_line, tell
+from purerl.core.errors import RunError, UserError, one_line
+from purerl.runs.command_errors import leave, tell
 
 SHEET = 4  # rows and columns of the contact sheet
 SHEET_WIDTH = 320  # of each of its images [pixels]

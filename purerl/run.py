@@ -24,8 +24,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from purerl import exact
-from purerl.core.errors import USAGE, RunError, StoppedError, UserError, leave, tell
+from purerl.core.errors import USAGE, RunError, StoppedError, UserError
 from purerl.runs import experiment
+from purerl.runs.command_errors import leave, tell
 from purerl.runs.experiment import Experiment, Source
 
 

@@ -131,7 +131,7 @@ def fail_together() -> Iterator[None]:
 
 
 class Silent:
-    """Stands for the progress display and the recorder of a process that is not the first."""
+    """Stands for the progress display and the writer of a process that is not the first."""
 
     digest = None
 

@@ -26,9 +26,9 @@ warp.init()
 from mujoco.mjx._src import math as mjx_math  # noqa: E402
 from mujoco.mjx.third_party import mujoco_warp as mjw  # noqa: E402
 
+from purerl.core.errors import unknown_name  # noqa: E402
 from purerl.core.records import Array, PyTree  # noqa: E402
 from purerl.physics.engine_mjx import mjx_defaults, reading_shapes  # noqa: E402
-from purerl.physics.lookup import unknown_name  # noqa: E402
 from purerl.physics.warp_buffers import Batch, Shapes, Stage, make_call, put_model, room  # noqa: E402
 
 # Running out of iterations is the solver's setting; everything else drops something.

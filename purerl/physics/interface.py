@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 from flax import struct
 
+from purerl.core.errors import unknown_name
 from purerl.core.records import Array
-from purerl.physics.lookup import unknown_name
 
 ENGINES = ("auto", "c", "jax", "warp")
 

@@ -4,7 +4,6 @@ Everything that a reward or an observation reads is looked up here once, when th
 built: never by a literal index.
 """
 
-import difflib
 import hashlib
 from collections.abc import Iterable
 
@@ -12,6 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from purerl.core.errors import unknown_name
 from purerl.core.records import Array
 
 _TYPES = {
@@ -29,14 +29,6 @@ def hash_model(model: mujoco.MjModel, rest: tuple = ()) -> str:
     content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, content)
     return hashlib.sha256(content.tobytes() + repr(rest).encode()).hexdigest()
-
-
-def unknown_name(kind: str, name: str, valid: Iterable[str]) -> str:
-    """The message for a name that is not there: the nearest match, and all there are."""
-    valid = [v for v in valid if v]
-    near = difflib.get_close_matches(str(name), valid, n=1)
-    hint = f" Did you mean {near[0]!r}?" if near else ""
-    return f"There is no {kind} {name!r}.{hint} There are: {', '.join(valid) or 'none'}."
 
 
 def names(model: mujoco.MjModel, kind: str) -> list[str]:

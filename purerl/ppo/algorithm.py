@@ -18,7 +18,8 @@ from purerl.core.records import Array, Metrics, Network, PyTree, TrainState, add
 from purerl.ppo import running_moments
 from purerl.ppo.batches import Batch, make_batch
 from purerl.ppo.config import Config
-from purerl.ppo.learner import learn, optimizer
+from purerl.ppo.learner import learn
+from purerl.ppo.optimizer import optimizer
 from purerl.ppo.rollout import Transition, rollout, start_episodes
 from purerl.ppo.running_moments import Moments
 

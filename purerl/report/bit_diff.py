@@ -1,16 +1,17 @@
 """Runs of one configuration and seed: the same to the last bit, or where they part."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from purerl.report.run_reader import History
-from purerl.runs import checkpoint, manifest
+from purerl.report.run_reader import RunRecord
+from purerl.runs import checkpoint_folder, manifest
 
 SHOWN = 3  # differing leaves that are named
 
 
-class Comparison(NamedTuple):
-    """Two runs that should be one."""
+class BitDiff(NamedTuple):
+    """What was found in two runs that should be one."""
 
     first: str
     second: str
@@ -22,57 +23,57 @@ class Comparison(NamedTuple):
     leaves: list[str]  # that differ in the earliest checkpoint that shows it, in path order
 
 
-def twins(runs: Sequence[History]) -> list[tuple[History, History]]:
-    """Returns pairs of runs of one configuration and seed: the first with each other one."""
-    first: dict[str, History] = {}
-    pairs = []
-    for run in runs:
-        known = first.setdefault(identity(run), run)
-        if known is not run:
-            pairs.append((known, run))
-    return pairs
+def repeats(runs: Iterable[RunRecord]) -> list[tuple[RunRecord, RunRecord]]:
+    """Returns pairs of runs of one configuration and seed: the first with each later one."""
+    first: dict[str, RunRecord] = {}
+    pairs = ((first.setdefault(configuration_and_seed(run), run), run) for run in runs)
+    return [(known, run) for known, run in pairs if known is not run]
 
 
-def identity(run: History) -> str:
-    """Returns what decides a run's bits as far as its settings go."""
-    return repr((run.experiment, run.seed, sorted(run.settings.items(), key=str)))
+def configuration_and_seed(run: RunRecord) -> str:
+    """Returns all of a run's settings that its bits depend on, as text."""
+    return repr((run.seed, sorted(run.settings.items(), key=str)))
 
 
-def compare(a: History, b: History) -> Comparison:
+def compare_bits(a: RunRecord, b: RunRecord) -> BitDiff:
     """Compares two runs by the digests in their metrics, and by their checkpoints' leaves."""
     conditions = manifest.differences(a.manifest, b.manifest)
     if a.source != b.source:
         conditions.append("experiment.py: the files differ")
     ours, theirs = a.digests(), b.digests()
     common = sorted(ours.keys() & theirs.keys())
-    parted = [update for update in common if ours[update] != theirs[update]]
-    equal = [update for update in common if not parted or update < parted[0]]
-    lines, leaves = _metrics_part(a, b), list[str]()
+    parted = next((update for update in common if ours[update] != theirs[update]), None)
+    equal = [update for update in common if parted is None or update < parted]
+    lines, leaves = _first_metrics_that_differ(a, b), list[str]()
     if not common:
         lines.insert(0, "they have no checkpoint of the same update, so no digests to compare")
-    elif not parted:
-        lines.insert(0, f"same: {len(common)} digests, the last {ours[common[-1]]} of update "
-                        f"{common[-1]}")  # fmt: skip
+    elif parted is None:
+        last = f"the last {ours[common[-1]]} of update {common[-1]}"
+        lines.insert(0, f"same: {len(common)} digests, {last}")
     else:
         before = f"the same at update {equal[-1]}, " if equal else ""
-        lines.insert(0, f"different: {before}not at update {parted[0]}")
-        leaf_line, leaves = _leaves_part(a, b)
+        lines.insert(0, f"different: {before}not at update {parted}")
+        leaf_line, leaves = _first_leaves_that_differ(a, b)
         lines.append(leaf_line)
-    if conditions:
-        lines += [f"other conditions: {line}" for line in conditions]
-    return Comparison(
+    return BitDiff(
         first=str(a.path),
         second=str(b.path),
-        same=not parted if common else None,
+        same=parted is None if common else None,
         promised=not conditions and all(run.manifest.get("bit_exact", True) for run in (a, b)),
-        lines=lines,
+        lines=lines + [f"other conditions: {line}" for line in conditions],
         last_equal=equal[-1] if equal else None,
-        parted=parted[0] if parted else None,
+        parted=parted,
         leaves=leaves,
     )
 
 
-def _metrics_part(a: History, b: History) -> list[str]:
+def differing_conditions(runs: Sequence[RunRecord]) -> list[str]:
+    """Lists in what the machines and versions of the runs differ from the first one's."""
+    found = [manifest.differences(runs[0].manifest, run.manifest) for run in runs[1:]]
+    return list(dict.fromkeys(line for lines in found for line in lines))
+
+
+def _first_metrics_that_differ(a: RunRecord, b: RunRecord) -> list[str]:
     """Finds the first line of the metrics that differs: finer than checkpoints."""
     theirs = {line["update"]: line for line in b.lines}
     for line in a.lines:
@@ -88,26 +89,27 @@ def _metrics_part(a: History, b: History) -> list[str]:
     return []
 
 
-def _leaves_part(a: History, b: History) -> tuple[str, list[str]]:
-    """Finds the earliest checkpoint that both still have and in which a leaf differs."""
+def _first_leaves_that_differ(a: RunRecord, b: RunRecord) -> tuple[str, list[str]]:
+    """Finds the earliest checkpoint that both still have and in which a leaf differs.
+
+    Returns:
+      A line for a person, and the paths of the leaves that differ.
+    """
     folders = [run.path / "checkpoints" for run in (a, b)]
-    both = sorted(set(checkpoint.updates(folders[0])) & set(checkpoint.updates(folders[1])))
-    for update in both:
+    for update in checkpoint_folder.common_updates(folders):
         try:
-            ours, theirs = (_hashes(folder, update) for folder in folders)
-        except checkpoint.DamagedError as error:
+            ours, theirs = (_leaf_hashes(folder, update) for folder in folders)
+        except checkpoint_folder.DamagedError as error:
             return f"leaves cannot be compared: a checkpoint of {update} is damaged: {error}", []
         paths = sorted({*ours, *theirs})
         leaves = [path for path in paths if ours.get(path) != theirs.get(path)]
         if leaves:
             named = ", ".join(leaves[:SHOWN]) + (", ..." if len(leaves) > SHOWN else "")
-            line = (
-                f"{len(leaves)} of {len(paths)} leaves differ in the checkpoint of update {update}"
-            )
-            return f"{line}, the first {named}", leaves
+            where = f"leaves differ in the checkpoint of update {update}, the first {named}"
+            return f"{len(leaves)} of {len(paths)} {where}", leaves
     return "leaves cannot be compared: the checkpoints that differ are deleted (see --keep)", []
 
 
-def _hashes(folder: Any, update: int) -> dict[str, dict[str, Any]]:
+def _leaf_hashes(folder: Path, update: int) -> dict[str, dict[str, Any]]:
     """Returns path -> dtype, shape and sha256 of a checkpoint's leaves."""
-    return checkpoint.load_meta(folder / f"{update:012d}")["leaves"]
+    return checkpoint_folder.load_meta(checkpoint_folder.path_of(folder, update))["leaves"]

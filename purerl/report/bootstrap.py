@@ -18,7 +18,6 @@ LEAST_RUNS = 5  # below, no interval is given
 RESAMPLES = 5000
 LEVEL = 0.95
 Values = np.ndarray
-Statistic = Callable[[Values], Values]  # [..., n] -> [...]
 
 
 class Interval(NamedTuple):
@@ -92,27 +91,30 @@ def enough(*groups: Sequence[Values]) -> bool:
 
 def iqm_interval(strata: Sequence[Values], seed: int = 0) -> Interval | None:
     """Returns the stratified bootstrap interval of the IQM; None for too few runs."""
-    if not enough(strata):
-        return None
-    return percentile_interval(pooled_iqm(resample(strata, seed)))
+    return _interval(pooled_iqm, [strata], seed)
 
 
 def difference_interval(
     xs: Sequence[Values], ys: Sequence[Values], seed: int = 0
 ) -> Interval | None:
     """Returns the interval of IQM(x) - IQM(y), both resampled; None for too few runs."""
-    if not enough(xs, ys):
-        return None
-    return percentile_interval(pooled_iqm(resample(xs, seed)) - pooled_iqm(resample(ys, seed + 1)))
+    return _interval(lambda x, y: pooled_iqm(x) - pooled_iqm(y), [xs, ys], seed)
 
 
 def improvement_interval(
     xs: Sequence[Values], ys: Sequence[Values], seed: int = 0
 ) -> Interval | None:
     """Returns the interval of the probability of improvement; None for too few runs."""
-    if not enough(xs, ys):
+    return _interval(stratified_probability, [xs, ys], seed)
+
+
+def _interval(
+    statistic: Callable[..., Values], groups: Sequence[Sequence[Values]], seed: int
+) -> Interval | None:
+    """Returns the interval of a statistic of groups, each resampled; None for too few runs."""
+    if not enough(*groups):
         return None
-    return percentile_interval(stratified_probability(resample(xs, seed), resample(ys, seed + 1)))
+    return percentile_interval(statistic(*(resample(x, seed + i) for i, x in enumerate(groups))))
 
 
 class Band(NamedTuple):

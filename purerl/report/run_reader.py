@@ -1,4 +1,4 @@
-"""Runs read back to be compared: what was set, what was measured, how far each came."""
+"""Reads runs back from their folders: settings, metrics, and how far each run came."""
 
 import glob
 import json
@@ -7,20 +7,20 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from purerl.core.errors import UserError, one_line, unknown
-from purerl.runs.loop import MAX_SKIPPED_IN_A_ROW
-from purerl.runs.run_folder import runs_in
+from purerl.core.errors import UserError, one_line, unknown_name
+from purerl.ppo.config import Config
+from purerl.runs.files import read_json, runs_in
+from purerl.runs.loggers import MAX_SKIPPED_IN_A_ROW
 
 NOT_LEARNING = ("seed", "evaluation")  # settings that tell runs of one configuration apart
 
 
-class History(NamedTuple):
+class RunRecord(NamedTuple):
     """One run's folder, read."""
 
     path: Path
-    experiment: str
     seed: int
-    settings: dict[str, Any]  # "ppo.learning_rate" -> value; without NOT_LEARNING
+    settings: dict[str, Any]  # "experiment", "ppo.learning_rate", ...; without NOT_LEARNING
     manifest: dict[str, Any]
     source: bytes  # of experiment.py
     lines: list[dict[str, Any]]  # of metrics.jsonl
@@ -76,18 +76,17 @@ def find_runs(arguments: Iterable[Path]) -> list[Path]:
     return list(dict.fromkeys(found))
 
 
-def read(path: Path) -> History:
+def read(path: Path) -> RunRecord:
     """Reads one run's folder."""
-    config = _read_json(path / "config.json")
+    config = read_json(path / "config.json")
     try:
-        settings, experiment = config["settings"], config["experiment"]
+        settings = config["settings"]
         learning = {k: v for k, v in settings.items() if k not in NOT_LEARNING}
-        return History(
+        return RunRecord(
             path=path,
-            experiment=experiment,
             seed=settings["seed"],
-            settings=flatten(learning),
-            manifest=_read_json(path / "manifest.json"),
+            settings=flatten({"experiment": config["experiment"]} | learning),
+            manifest=read_json(path / "manifest.json"),
             source=(path / "experiment.py").read_bytes(),
             lines=_read_lines(path / "metrics.jsonl"),
             planned=planned_updates(settings["ppo"]),
@@ -107,33 +106,19 @@ def flatten(value: Any, path: str = "") -> dict[str, Any]:
 
 
 def planned_updates(ppo: dict[str, Any]) -> int | None:
-    """Returns how many updates a run has by its settings; None if they are of another version."""
-    from purerl.ppo.config import Config
-
+    """Returns how many updates a run's settings ask for; None if this version cannot read them."""
     try:
         return Config(**ppo).num_updates
     except (TypeError, ValueError):
         return None
 
 
-def metric_names(runs: Sequence[History]) -> list[str]:
-    """Returns the metrics that any of the runs has."""
-    own = {"update", "steps", "wall_s", "digest"}
-    return sorted({name for run in runs for line in run.lines for name in line} - own)
-
-
-def check_metric(runs: Sequence[History], metric: str) -> None:
+def check_metric(runs: Sequence[RunRecord], metric: str) -> None:
     """Raises UserError unless some run has the metric."""
-    names = metric_names(runs)
+    names = {name for run in runs for line in run.lines for name in line}
+    names -= {"update", "steps", "wall_s", "digest"}
     if metric not in names:
-        raise unknown("metric", metric, names, " in these runs")
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read: {one_line(error)}") from error
+        raise UserError(unknown_name("metric", metric, sorted(names), " in these runs"))
 
 
 def _read_lines(path: Path) -> list[dict[str, Any]]:

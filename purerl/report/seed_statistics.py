@@ -1,23 +1,23 @@
-"""Groups of runs: which belong together, what each scored, and how groups stand to each other."""
+"""Groups of runs: which runs belong together, what each group scored, how two groups differ."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from purerl.core.errors import UserError, unknown
+from purerl.core.errors import UserError, unknown_name
 from purerl.report import bootstrap
-from purerl.report.bit_diff import identity
+from purerl.report.bit_diff import configuration_and_seed
 from purerl.report.bootstrap import Interval
-from purerl.report.run_reader import History
+from purerl.report.run_reader import RunRecord
 
 
 class Group(NamedTuple):
     """Runs that differ in nothing but their seed, or in what the grouping leaves aside."""
 
     label: str
-    runs: list[History]  # each seed of a configuration once
-    strata: dict[str, list[History]]  # what the grouping leaves aside -> its runs
+    runs: list[RunRecord]  # each seed of a configuration once
+    strata: dict[str, list[RunRecord]]  # what the grouping leaves aside -> its runs
 
 
 class Summary(NamedTuple):
@@ -61,52 +61,46 @@ class Curve(NamedTuple):
     runs: list[dict[int, float]]
 
 
-def all_settings(run: History) -> dict[str, Any]:
-    """Returns what runs can be grouped by."""
-    return {"experiment": run.experiment} | run.settings
-
-
-def differing(runs: Sequence[History]) -> dict[str, list[Any]]:
+def differing(runs: Sequence[RunRecord]) -> dict[str, list[Any]]:
     """Returns the settings in which the runs differ, each with its values."""
-    settings = [all_settings(run) for run in runs]
+    settings = [run.settings for run in runs]
     names = list(dict.fromkeys(name for s in settings for name in s))
     values = {n: {repr(s.get(n)): s.get(n) for s in settings} for n in names}
     return {name: list(found.values()) for name, found in values.items() if len(found) > 1}
 
 
-def make_groups(runs: Sequence[History], group_by: Sequence[str]) -> list[Group]:
+def make_groups(runs: Sequence[RunRecord], group_by: Sequence[str]) -> list[Group]:
     """Groups runs by the settings named, or by all in which they differ (but the seed).
 
     Raises:
       UserError: there is no such setting.
     """
-    valid = {name for run in runs for name in all_settings(run)}
+    valid = {name for run in runs for name in run.settings}
     by = [name.replace("-", "_") for name in group_by] or list(differing(runs))
     for name in by:
         if name not in valid:
-            raise unknown("setting", name, valid, " to group by")
-    members: dict[str, dict[str, History]] = {}
+            raise UserError(unknown_name("setting", name, sorted(valid), " to group by"))
+    members: dict[str, dict[str, RunRecord]] = {}
     for run in runs:
-        members.setdefault(label_of(run, by), {}).setdefault(identity(run), run)
+        members.setdefault(label_of(run, by), {}).setdefault(configuration_and_seed(run), run)
     return [
         Group(label, list(found.values()), strata_of(list(found.values()), by))
         for label, found in members.items()
     ]
 
 
-def label_of(run: History, by: Sequence[str]) -> str:
+def label_of(run: RunRecord, by: Sequence[str]) -> str:
     """Returns a group's name: the experiment, and the settings that make the difference."""
-    settings = all_settings(run)
-    words = [f"{name}={settings.get(name)}" for name in by if name != "experiment"]
+    words = [f"{name}={run.settings.get(name)}" for name in by if name != "experiment"]
     named = "experiment" in by or not words
-    return " ".join([run.experiment, *words] if named else words)
+    return " ".join([run.settings["experiment"], *words] if named else words)
 
 
-def strata_of(runs: Sequence[History], by: Sequence[str]) -> dict[str, list[History]]:
+def strata_of(runs: Sequence[RunRecord], by: Sequence[str]) -> dict[str, list[RunRecord]]:
     """Sorts a group's runs by the settings that the grouping leaves aside."""
-    strata: dict[str, list[History]] = {}
+    strata: dict[str, list[RunRecord]] = {}
     for run in runs:
-        rest = {k: v for k, v in all_settings(run).items() if k not in by}
+        rest = {k: v for k, v in run.settings.items() if k not in by}
         strata.setdefault(repr(sorted(rest.items())), []).append(run)
     return dict(sorted(strata.items()))
 
@@ -114,13 +108,13 @@ def strata_of(runs: Sequence[History], by: Sequence[str]) -> dict[str, list[Hist
 # --- scores ---
 
 
-def score(run: History, metric: str) -> float | None:
+def score(run: RunRecord, metric: str) -> float | None:
     """Returns a run's last value of the metric; None if it does not count."""
     curve = run.curve(metric)
     return curve[max(curve)] if curve and run.status != "unfinished" else None
 
 
-def by_seed(runs: Sequence[History], metric: str) -> dict[int, float]:
+def by_seed(runs: Sequence[RunRecord], metric: str) -> dict[int, float]:
     """Returns seed -> score of the runs of a stratum that count; it has each seed once."""
     return {run.seed: s for run in runs if (s := score(run, metric)) is not None}
 
@@ -180,11 +174,14 @@ def versus(group: Group, baseline: Group, metric: str) -> Versus | None:
 
 
 def paired_differences(group: Group, baseline: Group, metric: str) -> list[bootstrap.Values]:
-    """Returns group's score less baseline's on seeds that both have, [n_k] of each shared stratum.
+    """Returns the group's scores minus the baseline's on the seeds that both have.
 
-    A seed makes the same initial weights in networks of one shape, and they decide much: returns of
-    eight seeds of brax's ant under three versions of the learner correlated by 0.71 to 0.84, and
+    Equal seeds give networks of one shape the same initial weights, and these decide much. Returns
+    of eight seeds of brax's ant under three versions of the learner correlated by 0.71 to 0.84, and
     the paired interval was less than half as wide.
+
+    Returns:
+      [n_k] for each stratum that both groups have.
     """
     found = []
     for key in sorted(group.strata.keys() & baseline.strata.keys()):

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from purerl.core.env import Env, EnvError
-from purerl.core.errors import RunError, UserError, one_line, own_line
+from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.records import Network
 from purerl.devices.check_sizes import check_minibatches
 from purerl.devices.programs import abstract_state
@@ -16,6 +16,7 @@ from purerl.ppo.config import Config
 from purerl.ppo.learner import is_recurrent
 from purerl.runs.check_env import check_members, check_shapes
 from purerl.runs.check_network import check_network
+from purerl.runs.command_errors import own_line
 from purerl.runs.experiment import Experiment
 
 

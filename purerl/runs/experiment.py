@@ -20,8 +20,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import tyro
 
-import purerl
-from purerl.core.errors import UserError, one_line, unknown
+from purerl.core.errors import UserError, one_line, unknown_name
 from purerl.ppo.config import Config, Evaluation
 
 
@@ -65,7 +64,7 @@ class Source(NamedTuple):
 
 def folders() -> list[Path]:
     """Returns where named experiments are looked for: here, then beside the library."""
-    places = [Path.cwd() / "experiments", Path(purerl.__file__).parent.parent / "experiments"]
+    places = [Path.cwd() / "experiments", Path(__file__).parents[2] / "experiments"]
     return [place for place in dict.fromkeys(places) if place.is_dir()]
 
 
@@ -100,7 +99,8 @@ def find(name: str) -> Source:
         return load(named[name])
     if "." in name:
         return _from_module(name)
-    raise unknown("experiment", name, named, f" in {' or '.join(map(str, folders())) or 'sight'}")
+    places = f" in {' or '.join(map(str, folders())) or 'sight'}"
+    raise UserError(unknown_name("experiment", name, named, places))
 
 
 def load(path: Path, name: str = "", copy_of: Path | None = None) -> Source:
@@ -165,7 +165,7 @@ def _from_module(name: str) -> Source:
     except (ImportError, ValueError):
         spec = None
     if spec is None or spec.origin is None:
-        raise unknown("experiment", name, available())
+        raise UserError(unknown_name("experiment", name, available()))
     path = Path(spec.origin)
     with _mistakes(spec.origin, path):
         module = importlib.import_module(name)
@@ -262,4 +262,5 @@ def _check_names(names: list[str], values: Any, path: str) -> None:
         if name not in values:
             raise UserError(f"config.json lacks {_join(path, name)}, which the experiment has.")
         if name not in names:
-            raise unknown("setting", _join(path, name), [_join(path, n) for n in names])
+            valid = [_join(path, n) for n in names]
+            raise UserError(unknown_name("setting", _join(path, name), valid))

@@ -1,8 +1,8 @@
 """What a run tells: metrics.jsonl, which is part of the run, and loggers, which are not.
 
-metrics.jsonl is exact: resumed or not, it holds the same lines. TensorBoard and W&B live in
-threads of their own behind bounded queues; one that raises or cannot keep up is dropped, once and
-aloud, and training never waits for it.
+metrics.jsonl is exact: it holds the same lines whether the run was resumed or not. TensorBoard and
+W&B have threads of their own. Training never waits for them: a logger that raises an error, or
+cannot keep up, is dropped with one message.
 """
 
 import json
@@ -11,21 +11,22 @@ import queue
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from purerl.core.errors import UserError, one_line
 
 Record = dict[str, Any]
 Say = Callable[[str], None]
 
+MAX_SKIPPED_IN_A_ROW = 10  # minibatches; a run that skips so many cannot go on
 COUNTS = ("episodes", "nonfinite_resets", "replayed_resets", "reused_resets", "skipped_minibatches")
 
 
 def summarize(window: Sequence[Mapping[str, Any]]) -> Record:
-    """Joins the metrics of several updates: counts are summed, the rest averaged.
+    """Joins the metrics of several updates: counts are summed, the rest is averaged.
 
-    What is known of ended episodes (`episode...`) is averaged over episodes, not over updates, and
-    None where none ended.
+    Metrics of episodes that ended (`episode...`) are averaged over the episodes, not over the
+    updates. They are None if no episode ended.
     """
     episodes = sum(float(metrics["episodes"]) for metrics in window)
     record: Record = {}
@@ -45,16 +46,11 @@ def summarize(window: Sequence[Mapping[str, Any]]) -> Record:
     return record
 
 
-def finite_or_none(value: Any) -> Any:
-    """Returns NaN and infinities as None: JSON has no such numbers."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 class MetricsFile:
-    """metrics.jsonl: whole lines, appended and flushed, cut back to where a checkpoint was taken.
+    """metrics.jsonl: whole lines, written at once. A resumed run first cuts it back.
 
-    A line that the disk refuses is kept and written with the next one, so that a disk that was full
-    for a while leaves no gap.
+    A line that the disk refuses is kept and written with the next one. So a disk that was full for
+    a while leaves no gap.
     """
 
     def __init__(self, path: Path, offset: int) -> None:
@@ -71,8 +67,9 @@ class MetricsFile:
 
     def append(self, record: Record) -> int:
         """Writes one line; returns the file's length after it [bytes]. OSError: not written yet."""
-        clean = {name: finite_or_none(value) for name, value in record.items()}
-        self.pending += json.dumps(clean, allow_nan=False).encode() + b"\n"
+        # JSON has no NaN and no infinity.
+        odd = {k: None for k, v in record.items() if isinstance(v, float) and not math.isfinite(v)}
+        self.pending += json.dumps(record | odd, allow_nan=False).encode() + b"\n"
         try:
             written = self.file.write(self.pending)
             if written != len(self.pending):
@@ -89,22 +86,13 @@ class MetricsFile:
         self.file.close()
 
 
-class Sink(Protocol):
-    """Where a logger's records go."""
-
-    def log(self, record: Record) -> None:
-        """Takes one record."""
-        ...
-
-    def close(self) -> None:
-        """Flushes."""
-        ...
-
-
 class BackgroundLogger:
-    """A sink in a thread of its own; dropped, with one message, when it raises or lags."""
+    """A sink in a thread of its own; dropped, with one message, when it raises or lags.
 
-    def __init__(self, name: str, open_sink: Callable[[], Sink], say: Say, size: int = 256) -> None:
+    A sink is what has `log(record)` and `close()`.
+    """
+
+    def __init__(self, name: str, open_sink: Callable[[], Any], say: Say, size: int = 256) -> None:
         """Opens the sink in the thread; `size` records may wait before it counts as too slow."""
         self.name, self.say = name, say
         self.queue: queue.Queue[Record | None] = queue.Queue(size)
@@ -134,7 +122,7 @@ class BackgroundLogger:
         if self.thread.is_alive():
             self._drop(f"it did not finish within {timeout:g} s")
 
-    def _work(self, open_sink: Callable[[], Sink]) -> None:
+    def _work(self, open_sink: Callable[[], Any]) -> None:
         try:
             sink = open_sink()
             while (record := self.queue.get()) is not None and not self.dropped.is_set():

@@ -18,11 +18,10 @@ from purerl.core.errors import RunError, StoppedError
 from purerl.core.records import Metrics, PyTree, TrainState, count_as_int
 from purerl.devices.programs import Programs
 from purerl.ppo.config import Config, Evaluation
-from purerl.runs import checkpoint, state_arrays
-from purerl.runs.loggers import Record, Say, summarize
-from purerl.runs.writer import Recorder
+from purerl.runs import checkpoint_folder, state_arrays
+from purerl.runs.loggers import MAX_SKIPPED_IN_A_ROW, Record, Say, summarize
+from purerl.runs.writer import RunWriter
 
-MAX_SKIPPED_IN_A_ROW = 10
 DEFAULT_LINES = 500  # in metrics.jsonl, about
 
 
@@ -90,7 +89,7 @@ def train(
     plan: Plan,
     programs: Programs,
     state: TrainState,
-    recorders: Sequence[Recorder],
+    writers: Sequence[RunWriter],
     progress: Progress,
     stop: Callable[[], bool],
     say: Say,
@@ -102,7 +101,7 @@ def train(
       plan: what to do when.
       programs: the compiled functions.
       state: where to begin; it is consumed.
-      recorders: what writes metrics and checkpoints, one for each vmapped seed.
+      writers: what writes metrics and checkpoints, one for each vmapped seed.
       progress: told of every chunk.
       stop: asked between chunks whether to save and stop.
       say: prints a line.
@@ -113,7 +112,7 @@ def train(
       StoppedError: stopped on request, saved.
       RunError: the numbers are no longer finite, or the last checkpoint could not be saved.
     """
-    number = len(recorders)
+    number = len(writers)
     first = update = safe = meta["update"]  # safe: a kill after this update loses nothing
     begin = time.perf_counter()
     while update < plan.updates:
@@ -124,7 +123,7 @@ def train(
         update = end
         seconds = time.perf_counter() - begin
         records = make_records(state, update, meta["wall_s"] + seconds, window, number)
-        check_finite(state, records, recorders)
+        check_finite(state, records, writers)
         if update in plan.evaluations:
             judged = each_seed(jax.device_get(programs.evaluate(state)), number)
             for record, metrics in zip(records, judged, strict=True):
@@ -133,16 +132,16 @@ def train(
             say(describe_evaluation(records, plan))
         planned = update in plan.checkpoints
         if planned or stop():
-            _save(programs.fetch(state), records, recorders, meta, planned)
+            _save(programs.fetch(state), records, writers, meta, planned)
             safe = update
         else:
-            for recorder, record in zip(recorders, records, strict=True):
-                recorder.write(record)
+            for writer, record in zip(writers, records, strict=True):
+                writer.write(record)
         rate = (update - first) / (time.perf_counter() - begin)
         left = (plan.updates - update) / rate
         progress.show(shown_record(records), left, rate * plan.steps_per_update * number)
-    for recorder in recorders:
-        recorder.finish()
+    for writer in writers:
+        writer.finish()
     if update < plan.updates:
         state_of = "it is saved" if update else "there is nothing to save yet"
         raise StoppedError(f"Stopped after update {update} of {plan.updates}; {state_of}.")
@@ -191,7 +190,7 @@ def shown_record(records: Sequence[Record]) -> Record:
 
 
 def check_finite(
-    state: TrainState, records: Sequence[Record], recorders: Sequence[Recorder]
+    state: TrainState, records: Sequence[Record], writers: Sequence[RunWriter]
 ) -> None:
     """Raises RunError when parameters are not finite, or nothing of late could be learnt from.
 
@@ -202,13 +201,13 @@ def check_finite(
             params = each_seed(state_arrays.flatten(state.params), len(records))[i]
             bad = [k for k, x in params.items() if not np.isfinite(x.astype(np.float64)).all()]
             reason = f"Parameters are not finite: {', '.join(bad) or 'their norm overflows'}. "
-            _give_up(i, records, recorders, reason + "Lower ppo.learning_rate.")
+            _give_up(i, records, writers, reason + "Lower ppo.learning_rate.")
         if math.isnan(record["train/reward"]):
             reason = (
                 "No step of an update was sound: of each, some number of the state is NaN or "
                 "absurd. `purerl.core.env.check_env(env)` tells which."
             )
-            _give_up(i, records, recorders, reason)
+            _give_up(i, records, writers, reason)
         skipped = record["train/skipped_in_a_row"]
         if skipped >= MAX_SKIPPED_IN_A_ROW:
             reason = (
@@ -216,35 +215,35 @@ def check_finite(
                 "skipped. Lower ppo.learning_rate or ppo.reward_scale, or mend the environment's "
                 "reward."
             )
-            _give_up(i, records, recorders, reason)
+            _give_up(i, records, writers, reason)
 
 
 def _save(
     state: TrainState,
     records: Sequence[Record],
-    recorders: Sequence[Recorder],
+    writers: Sequence[RunWriter],
     meta: Record,
     planned: bool,
 ) -> None:
     parts = each_seed(state_arrays.flatten(state), len(records))
-    for leaves, record, recorder in zip(parts, records, recorders, strict=True):
+    for leaves, record, writer in zip(parts, records, writers, strict=True):
         score = record.get("eval/episode_return")
         about = meta | {name: record[name] for name in ("update", "steps", "wall_s")}
         about["eval_return"] = score if score is not None and math.isfinite(score) else None
-        recorder.save(record, leaves, about, planned)
+        writer.save(record, leaves, about, planned)
 
 
 def _give_up(
-    lost: int, records: Sequence[Record], recorders: Sequence[Recorder], reason: str
+    lost: int, records: Sequence[Record], writers: Sequence[RunWriter], reason: str
 ) -> None:
     """Ends the run with an error about seed number `lost`; metrics are kept, the state is not."""
-    for recorder, record in zip(recorders, records, strict=True):
-        recorder.write(record)
-    for recorder in recorders:
-        recorder.close()
-    folder = recorders[lost].checkpoints
-    found = checkpoint.updates(folder)
-    kept = folder / f"{found[-1]:012d}" if found else "none"
+    for writer, record in zip(writers, records, strict=True):
+        writer.write(record)
+    for writer in writers:
+        writer.close()
+    folder = writers[lost].checkpoints
+    found = checkpoint_folder.updates(folder)
+    kept = checkpoint_folder.path_of(folder, found[-1]) if found else "none"
     raise RunError(
         f"Update {records[lost]['update']} of {folder.parent}: {reason} The last good checkpoint "
         f"is {kept}."

@@ -1,23 +1,21 @@
-"""What a run depends on besides its settings: versions, device, flags, source.
+"""The manifest: all that a run's bits depend on besides its settings.
 
-The same settings give the same bits only under the same manifest, so it is written down at the
-start, compared on resuming, and its fingerprint stands in every checkpoint.
+That is: versions, device, flags, source. The same settings give the same bits only under the same
+manifest. So a run writes it down at the start, `--resume` compares it, and every checkpoint holds
+its fingerprint.
 """
 
-import ast
-import functools
 import hashlib
-import importlib.util
 import json
 import os
 import platform
 import subprocess
-import sys
-import sysconfig
 from collections.abc import Callable, Iterable
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+from purerl.runs.source_hashes import source_hashes
 
 PACKAGES = ["jax", "jaxlib", "mujoco", "mujoco-mjx", "dm-control", "flax", "optax", "numpy"]
 PACKAGES += ["orbax-checkpoint"]
@@ -35,18 +33,15 @@ def collect(
 
     Args:
       engine: the physics engine in use, resolved ("auto" is not an answer).
-      builders: functions whose source folders are part of the run (build_env, build_network).
-      kernels: `kernels.how_chosen`.
-      num_shards: V; on how many devices share them the bits do not depend.
+      builders: functions whose source is part of the run (build_env, build_network).
+      kernels: `xla_flags.how_chosen`.
+      num_shards: V. How many devices share the shards changes no bit.
     """
     import jax
 
     packages = PACKAGES + (["warp-lang"] if engine == "warp" else [])
     device = jax.devices()[0]
-    about = {
-        "platform": device.platform,
-        "kind": _device_kind(device),
-    }
+    about = {"platform": device.platform, "kind": _device_kind(device)}
     if device.platform == "cpu":  # XLA's pool size changes the bits of matrix products on a CPU
         about["threads"] = max(cpu_threads(), jax.local_device_count())
     options = jax.config.values
@@ -75,7 +70,7 @@ def inexact_because(engine: str, kernels: str, unordered: Iterable[str] = ()) ->
 
     Args:
       engine: the physics engine.
-      kernels: `kernels.how_chosen`.
+      kernels: `xla_flags.how_chosen`.
       unordered: places of sums, in a program for a GPU, whose order nothing fixes.
     """
     reasons = [f"a sum without a fixed order: {place}" for place in unordered]
@@ -130,112 +125,6 @@ def differences(old: Any, new: Any, path: str = "") -> list[str]:
     return [] if old == new else [f"{path}: {old} -> {new}"]
 
 
-def source_hashes(builders: Iterable[Callable]) -> dict[str, str]:
-    """Returns a short sha256 of each file of the source that decides a run's bits, by module.
-
-    That is: every Python file that the algorithm and the builders import, but for installed
-    packages, and the bodies (`assets/*.xml`) beside. An edit of a plot or of another environment
-    does not keep a run from resuming.
-    """
-    names = ["purerl.ppo.algorithm", "purerl.ppo.evaluation"]
-    names += [module_of(builder) for builder in builders]
-    files = imported_files(names)
-    folders = {file.parent.parent / "assets" for file in files.values()}
-    bodies = {f"assets/{f.name}": f for folder in folders for f in folder.rglob("*.xml")}
-    # By name, not by place: a moved checkout is the same source.
-    return {
-        name: hashlib.sha256(file.read_bytes()).hexdigest()[:16]
-        for name, file in sorted((files | bodies).items())
-    }
-
-
-def module_of(builder: Callable) -> str:
-    """Returns the module that a function, or what wraps it as a partial, comes from."""
-    while isinstance(builder, functools.partial):
-        builder = builder.func
-    return builder.__module__
-
-
-def imported_files(names: Iterable[str]) -> dict[str, Path]:
-    """Returns module name -> file, of `names` and all they import.
-
-    Other packages' files count unless they are installed: those have a version.
-    """
-    todo = list(names)
-    ours = {name.partition(".")[0]: True for name in todo}
-    installed = installed_folders()
-    found: dict[str, Path] = {}
-    while todo:
-        name = todo.pop()
-        package = name.partition(".")[0]
-        if package not in ours:
-            ours[package] = not _is_within(package, installed)
-        file = module_file(name) if ours[package] and name not in found else None
-        if file is not None and file.suffix == ".py":
-            found[name] = file
-            todo += _imports(file)
-    return found
-
-
-def _is_within(package: str, folders: set[Path]) -> bool:
-    """Tells whether a package is in one of the folders, or nowhere."""
-    file = module_file(package)
-    if file is not None:
-        return not folders.isdisjoint(file.parents)
-    spec = importlib.util.find_spec(package) if package != "__main__" else None
-    places = (spec and spec.submodule_search_locations) or []  # of a package without __init__.py
-    return all(not folders.isdisjoint(Path(place).absolute().parents) for place in places)
-
-
-def installed_folders() -> set[Path]:
-    """Returns where Python and installed packages are: beside a package there is its metadata."""
-    places = {Path(place).absolute() for place in sys.path}
-    return {*filter(_holds_packages, places), Path(sysconfig.get_path("stdlib"))}
-
-
-def _holds_packages(folder: Path) -> bool:
-    try:
-        return any(name.endswith(".dist-info") for name in os.listdir(folder))
-    except PermissionError:  # whatever is in it, it cannot be this process's own source
-        return True
-    except OSError:  # an archive, or nothing
-        return False
-
-
-def module_file(name: str) -> Path | None:
-    """Returns a module's Python file; None for what is no module, such as an imported function.
-
-    Imports nothing: `find_spec` of a dotted name would import the module before the dot, and with
-    that of an engine all of MJX or Warp.
-    """
-    if name in sys.modules:
-        spec = getattr(sys.modules[name], "__spec__", None)
-        # A run's copy of an experiment says in `__file__` where the original is.
-        file = spec.origin if spec and spec.has_location else None
-        file = file or getattr(sys.modules[name], "__file__", None)
-        return Path(file) if file else None
-    package, *inside = name.split(".")
-    spec = importlib.util.find_spec(package)
-    if spec is None:
-        return None
-    if not inside:
-        return Path(spec.origin) if spec.has_location and spec.origin else None
-    places = [Path(place, *inside) for place in spec.submodule_search_locations or ()]
-    files = [file for place in places for file in (place / "__init__.py", place.with_suffix(".py"))]
-    return next((file for file in files if file.is_file()), None)
-
-
-def _imports(file: Path) -> list[str]:
-    """Returns every name that a file's import statements may mean as a module."""
-    names: list[str] = []
-    for node in ast.walk(ast.parse(file.read_bytes())):
-        if isinstance(node, ast.Import):
-            names += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-    return names
-
-
 def _version(package: str) -> str:
     try:
         return metadata.version(package)
@@ -257,18 +146,11 @@ def _device_kind(device: Any) -> str:
 
 def _git(folder: Path) -> dict[str, Any]:
     """Returns the revision of the checkout that `folder` is in, None outside of one."""
-
-    def ask(*words: str) -> str | None:
-        try:
-            done = subprocess.run(
-                ["git", "-C", str(folder), *words], capture_output=True, text=True, timeout=10
-            )
-        except (OSError, subprocess.TimeoutExpired):
-            return None
-        return done.stdout.strip() if done.returncode == 0 else None
-
-    status = ask("status", "--porcelain", "--untracked-files=no")
-    return {
-        "git_revision": ask("rev-parse", "HEAD"),
-        "git_dirty": None if status is None else bool(status),
-    }
+    words = ["git", "-C", str(folder), "describe", "--always", "--abbrev=40", "--exclude=*"]
+    try:
+        done = subprocess.run([*words, "--dirty"], capture_output=True, text=True, timeout=10)
+        said = done.stdout.strip()
+    except (OSError, subprocess.TimeoutExpired):
+        said = ""
+    revision = said.removesuffix("-dirty")
+    return {"git_revision": revision or None, "git_dirty": revision != said if said else None}

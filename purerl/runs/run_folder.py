@@ -2,7 +2,6 @@
 
 import contextlib
 import fcntl
-import json
 import os
 import shutil
 import uuid
@@ -10,19 +9,21 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-from purerl.core.errors import UserError, one_line
+from purerl.core.errors import UserError
 from purerl.core.records import TrainState
 from purerl.devices.programs import abstract_state
-from purerl.runs import checkpoint, experiment, manifest
+from purerl.runs import checkpoint, checkpoint_folder, experiment, manifest
 from purerl.runs.build_experiment import Setup, build, physics_hash
 from purerl.runs.experiment import Experiment, Source
+from purerl.runs.files import draft_of, read_json, runs_in, write_json
 from purerl.runs.loggers import Say
+from purerl.runs.source_hashes import module_file, source_hashes
 
 LOCK = ".lock"
 OURS = {LOCK, "config.json", "manifest.json", "experiment.py", "metrics.jsonl", "checkpoints"}
 
 
-class Run(NamedTuple):
+class RestoredRun(NamedTuple):
     """A run read back from its folder alone."""
 
     experiment: Experiment
@@ -32,7 +33,7 @@ class Run(NamedTuple):
 
 
 def lock(folder: Path) -> IO[str]:
-    """Makes the folder and takes it for this process; released when the process ends, however."""
+    """Makes the folder and locks it for this process, until the process ends in whatever way."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         handle = (folder / LOCK).open("a+")
@@ -55,7 +56,7 @@ def lock(folder: Path) -> IO[str]:
 
 @contextlib.contextmanager
 def refusals() -> Iterator[None]:
-    """Makes one line of a disk that refuses what a run needs before it can begin."""
+    """Turns a disk's refusal to write what a run needs at its beginning into a UserError."""
     try:
         yield
     except OSError as error:
@@ -64,9 +65,11 @@ def refusals() -> Iterator[None]:
 
 
 def check_new_or_resume(folders: Iterable[Path], resume: bool) -> None:
-    """Raises UserError when a folder holds a run and should not, or none of them does and should.
+    """Raises UserError if a new run would overwrite something, or there is nothing to resume.
 
-    A group of seeds that was killed while starting has the folders of some of them.
+    Args:
+      folders: one for each seed. Seeds that were killed while starting may have only some of them.
+      resume: whether the runs are to go on.
     """
     folders = list(folders)
     if resume and not any(folder.exists() for folder in folders):
@@ -76,7 +79,7 @@ def check_new_or_resume(folders: Iterable[Path], resume: bool) -> None:
         if is_run and not resume:
             raise UserError(f"The run {folder} exists; use --resume to go on, or another --name.")
         strange = {path.name for path in folder.iterdir()} - OURS if folder.is_dir() else set()
-        strange -= {_draft(folder / name).name for name in OURS}  # of a run killed while starting
+        strange -= {draft_of(folder / name).name for name in OURS}  # of a run killed while starting
         if strange and not is_run:
             raise UserError(f"{folder} is no run (it holds {min(strange)}); use another --name.")
 
@@ -109,7 +112,17 @@ def identity(folder: Path) -> dict[str, str]:
 def check_same(
     folder: Path, source: Source, settings: dict[str, Any], facts: dict[str, Any]
 ) -> list[str]:
-    """Lists in what this process differs from the one that began the run; empty: exact resume."""
+    """Lists how this process differs from the one that began the run.
+
+    Args:
+      folder: the run.
+      source: the experiment as it is now.
+      settings: what config.json would say now.
+      facts: what manifest.json would say now.
+
+    Returns:
+      A line for each difference; none: the run goes on exactly.
+    """
     found = manifest.differences(read_json(folder / "config.json"), settings)
     found += manifest.differences(read_json(folder / "manifest.json"), facts)
     if (folder / "experiment.py").read_bytes() != source.path.read_bytes():
@@ -120,13 +133,13 @@ def check_same(
 def accept_changes(
     folder: Path, source: Source, settings: dict[str, Any], facts: dict[str, Any], found: list[str]
 ) -> None:
-    """Writes down that the run goes on under other conditions, after which update, and as what.
+    """Writes down after which update the run goes on under other conditions, and which.
 
-    A copy under another name is a run of its own, which loggers must not take for the first one.
+    A copy under another name gets a run_id of its own: loggers must not take it for the first run.
     """
     old = read_json(folder / "manifest.json")
     known = {"run_id": old.get("run_id", ""), "name": old.get("name", folder.name)}
-    after = max(checkpoint.updates(folder / "checkpoints"), default=0)
+    after = max(checkpoint_folder.updates(folder / "checkpoints"), default=0)
     entry: dict[str, Any] = {"after_update": after, "changes": found}
     if known["name"] != folder.name:
         entry, known = {"of": known} | entry, identity(folder)
@@ -142,7 +155,7 @@ def amend(folder: Path, facts: dict[str, Any]) -> None:
     write_json(path, read_json(path) | facts)
 
 
-def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> Run:
+def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> RestoredRun:
     """Rebuilds a run from its folder alone, to see what its policy does; changes nothing in it.
 
     The state comes without `env`, `episode` and `optimizer`: a policy needs none of them, and on
@@ -173,20 +186,12 @@ def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> Run:
         say(f"{what} is not that of the run any more.")
     abstract = abstract_state(*setup[:3])
     abstract = abstract.replace(env=None, episode=None, optimizer=None)
-    return Run(chosen, setup, _choose(folder / "checkpoints", update, abstract, say), settings)
-
-
-def runs_in(place: Path) -> list[Path]:
-    """Returns a run, or the runs in a folder or its folders; [] if there is none."""
-    for pattern in ("config.json", "*/config.json", "*/*/config.json"):
-        runs = sorted(file.parent for file in place.glob(pattern))
-        if runs:
-            return runs
-    return []
+    saved = _choose(folder / "checkpoints", update, abstract, say)
+    return RestoredRun(chosen, setup, saved, settings)
 
 
 def changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[str]:
-    """Lists what a policy's doings depend on and is not as it was when the run began.
+    """Lists what has changed since the run began and may change what its policy does.
 
     Args:
       begun: the run's manifest.json.
@@ -194,10 +199,10 @@ def changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[s
       setup: what it builds now.
     """
     builders = (source.experiment.build_env, source.experiment.build_network)
-    then, now = begun.get("source"), manifest.source_hashes(builders)
+    then, now = begun.get("source"), source_hashes(builders)
     then = then if isinstance(then, dict) else {}
     edited = [name for name, value in now.items() if then.get(name) != value]
-    edited = [name for name in edited if manifest.module_file(name) != source.path]
+    edited = [name for name in edited if module_file(name) != source.path]
     few = ", ".join(edited[:3]) + (f" and {len(edited) - 3} more" if len(edited) > 3 else "")
     found = [f"The code of {few}"] if edited else []
     model = physics_hash(setup.env)
@@ -207,7 +212,7 @@ def changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[s
 
 
 def fill(old: Any, new: Any, say: Say, path: str = "") -> Any:
-    """Returns the settings `old` of a run with those of `new` that have come to the code since."""
+    """Returns the settings `old` of a run, and from `new` those that the code got since then."""
     if not (isinstance(old, dict) and isinstance(new, dict)):
         return old
     for name in new.keys() - old.keys():
@@ -216,41 +221,19 @@ def fill(old: Any, new: Any, say: Say, path: str = "") -> Any:
 
 
 def _choose(folder: Path, update: str, abstract: TrainState, say: Say) -> checkpoint.Saved:
-    found = checkpoint.updates(folder)
+    found = checkpoint_folder.updates(folder)
     if update == "latest":
-        saved = checkpoint.newest(folder, abstract, say, set_aside=False)
-        if saved is None:
+        whole = checkpoint.newest([folder], abstract, say, rename=False)
+        if not whole:
             raise UserError(f"{folder.parent} has no whole checkpoint yet.")
-        return saved
-    number = checkpoint.best_update(folder) if update == "best" else update
+        return whole[0]
+    number = checkpoint_folder.best_update(folder) if update == "best" else update
     if number is None:
         raise UserError(f"No checkpoint in {folder} was taken at an evaluation; try latest.")
     if str(number) not in map(str, found):
         valid = ", ".join(["latest", "best", *map(str, found)])
         raise UserError(f"There is no checkpoint {update!r} in {folder}. Valid: {valid}.")
     try:
-        return checkpoint.load(folder / f"{int(number):012d}", abstract)
-    except checkpoint.DamagedError as error:
+        return checkpoint.load(checkpoint_folder.path_of(folder, int(number)), abstract)
+    except checkpoint_folder.DamagedError as error:
         raise UserError(f"The checkpoint of update {number} is damaged: {error}.") from error
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Reads a JSON file of the run; UserError if it is missing or broken."""
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read: {one_line(error)}") from error
-
-
-def _draft(path: Path) -> Path:
-    return path.with_name(f".{path.name}.draft")
-
-
-def write_json(path: Path, value: dict[str, Any]) -> None:
-    """Writes a JSON file whole or not at all."""
-    draft = _draft(path)
-    try:
-        draft.write_text(json.dumps(value, indent=2) + "\n")
-        draft.replace(path)
-    except OSError as error:
-        raise UserError(f"{path} cannot be written: {error.strerror}.") from error

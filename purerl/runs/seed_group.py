@@ -17,10 +17,11 @@ from purerl.core.records import PyTree, TrainState
 from purerl.devices import processes
 from purerl.devices.processes import alone
 from purerl.devices.programs import Programs
-from purerl.runs import checkpoint, console, loop, manifest, run_folder
+from purerl.runs import checkpoint, checkpoint_folder, console, loop, manifest, run_folder
+from purerl.runs.files import read_json
 from purerl.runs.loggers import BackgroundLogger, Say, TensorBoardSink, WandbSink, check_installed
 from purerl.runs.video_process import RunVideo
-from purerl.runs.writer import Recorder
+from purerl.runs.writer import RunWriter
 
 if TYPE_CHECKING:
     from purerl.run import Options
@@ -59,40 +60,38 @@ def train_together(
         times = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items())
         progress.say(f"Compiled: {times}")
         state = first_state(meta.pop("found"), saved, seeds, programs(), abstract, progress.say)
-        recorders: list[Any] = [processes.Silent(folder) for folder in folders]
+        writers: list[Any] = [processes.Silent(folder) for folder in folders]
         if processes.is_first():
             with run_folder.refusals():
-                recorders = open_recorders(folders, saved, options, progress.say)
-            for folder, recorder in zip(folders, recorders, strict=True):
-                stack.callback(recorder.close)
-                recorder.loggers = [
-                    begin(folder, meta["update"], progress.say) for begin in loggers
-                ]
+                writers = open_writers(folders, saved, options, progress.say)
+            for folder, writer in zip(folders, writers, strict=True):
+                stack.callback(writer.close)
+                writer.loggers = [begin(folder, meta["update"], progress.say) for begin in loggers]
             if options.video:  # of the first seed: one such process is enough
-                recorders[0].loggers.append(RunVideo(folders[0], stop, progress.say))
+                writers[0].loggers.append(RunVideo(folders[0], stop, progress.say))
         meta["fingerprint"] = manifest.fingerprint(facts)
         loop.train(
             plan,
             programs(),
             programs().spread(state),
-            recorders,
+            writers,
             progress,
             processes.agreed(stop),
             progress.say,
             meta,
         )
-        for folder, recorder in zip(folders, recorders, strict=True):
+        for folder, writer in zip(folders, writers, strict=True):
             of = f" of {folder.name}" if options.num_seeds > 1 else ""
-            progress.say(f"Done: {plan.steps:,} steps{of}. Digest {recorder.digest}")
+            progress.say(f"Done: {plan.steps:,} steps{of}. Digest {writer.digest}")
 
 
 def find_saved(
     places: list[Path], abstract: PyTree, resume: bool, say: Say
 ) -> list[checkpoint.Saved]:
     """Returns the newest checkpoint that all `places` have, one each; [] if there is none yet."""
-    saved = checkpoint.newest_of_all(places, abstract, say)
+    saved = checkpoint.newest(places, abstract, say)
     if not saved:
-        checkpoint.check_none_lost(places)
+        checkpoint_folder.check_none_lost(places)
         if resume:
             say(f"There is no checkpoint in {places[0]}: it begins anew.")
     return saved
@@ -119,17 +118,17 @@ def first_state(
     return processes.state_of_first(state, abstract)
 
 
-def open_recorders(
+def open_writers(
     folders: list[Path], saved: list[checkpoint.Saved], options: "Options", say: Say
-) -> list[Recorder]:
+) -> list[RunWriter]:
     """Opens what writes each seed's folder, cut back to the checkpoints `saved`."""
-    worker = ThreadPoolExecutor(1, "purerl-recorder")
+    worker = ThreadPoolExecutor(1, "purerl-writer")
     together = [folder / "checkpoints" for folder in folders]
     for place in together:
-        checkpoint.forget_after(place, saved[0].meta["update"] if saved else 0)
+        checkpoint_folder.forget_after(place, saved[0].meta["update"] if saved else 0)
     offsets = [one.meta["metrics_bytes"] for one in saved] or [0] * len(folders)
     return [
-        Recorder(folder, offset, options.keep, [], say, worker, together)
+        RunWriter(folder, offset, options.keep, say, worker, together)
         for folder, offset in zip(folders, offsets, strict=True)
     ]
 
@@ -141,8 +140,8 @@ def needed_loggers(options: "Options") -> list[Callable[..., Any]]:
         return BackgroundLogger("TensorBoard", lambda: TensorBoardSink(folder, update), say)
 
     def wandb(folder: Path, update: int, say: Any) -> BackgroundLogger:
-        name = run_folder.read_json(folder / "manifest.json")["run_id"]
-        settings = run_folder.read_json(folder / "config.json")
+        name = read_json(folder / "manifest.json")["run_id"]
+        settings = read_json(folder / "config.json")
         return BackgroundLogger(
             "W&B",
             lambda: WandbSink(folder, options.wandb, options.wandb_project, name, settings),

@@ -24,8 +24,17 @@ from purerl.devices.programs import Programs, abstract_state, compile_programs
 from purerl.devices.shards import Shards
 from purerl.ppo.config import Config
 from purerl.ppo.learner import is_recurrent
-from purerl.runs import build_experiment, checkpoint, console, loop, manifest, run_folder
+from purerl.runs import (
+    build_experiment,
+    checkpoint,
+    checkpoint_folder,
+    console,
+    loop,
+    manifest,
+    run_folder,
+)
 from purerl.runs.experiment import Experiment, Source
+from purerl.runs.files import read_json
 from purerl.runs.seed_group import needed_loggers, train_together
 
 if TYPE_CHECKING:
@@ -72,7 +81,7 @@ def execute(
             begin_or_go_on(folder, source, settings, facts, abstract, options.allow_changes)
         lines = console.describe_plan(plan, setup, abstract, facts, list(runs), cache)
         print("\n".join(lines), flush=True)
-        return not all(checkpoint.updates(folder / "checkpoints") for folder in runs)
+        return not all(checkpoint_folder.updates(folder / "checkpoints") for folder in runs)
 
     with run_folder.refusals():
         fresh = alone(prepare)
@@ -122,7 +131,7 @@ def describe_process(
 def shards_on_disk(folders: Iterable[Path]) -> int:
     """Returns how many shards a run was begun with, 0 if there is none yet."""
     begun = [folder for folder in folders if (folder / "config.json").exists()]
-    return run_folder.read_json(begun[0] / "manifest.json").get("num_shards", 1) if begun else 0
+    return read_json(begun[0] / "manifest.json").get("num_shards", 1) if begun else 0
 
 
 def choose_shards(config: Config, abstract: PyTree, options: "Options", begun_with: int) -> Shards:

@@ -27,8 +27,7 @@ def leaf_paths(state: PyTree) -> list[str]:
 def flatten(state: PyTree) -> Leaves:
     """Copies a state to the host as `{path: array}`, keys as their raw data.
 
-    The copy is real: on a CPU `device_get` returns views of buffers that the next, donating update
-    overwrites.
+    It must copy: on a CPU `device_get` returns views of buffers, which the next update overwrites.
     """
     raw = jax.tree.map(lambda x: jax.random.key_data(x) if is_key(x) else x, state)
     host = [np.array(x, copy=True, order="C") for x in jax.tree.leaves(jax.device_get(raw))]

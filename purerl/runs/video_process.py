@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from purerl.core.errors import one_line
-from purerl.runs import checkpoint
+from purerl.runs import checkpoint_folder
 
 LOWEST_PRIORITY = 19  # of a Unix process
 
@@ -87,7 +87,7 @@ class RunVideo:
 
         An evaluation without a checkpoint of its own is shown by the next one.
         """
-        found = checkpoint.updates(self.folder / "checkpoints")
+        found = checkpoint_folder.updates(self.folder / "checkpoints")
         return self.wanted is not None and bool(found) and found[-1] >= self.wanted
 
     def _start(self) -> None:

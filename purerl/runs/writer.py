@@ -1,7 +1,7 @@
 """Writes a run's metrics and checkpoints, in order, from one background thread.
 
 The order matters: a checkpoint says how long metrics.jsonl was when it was taken. One thread keeps
-it without making training wait for hashes or the disk.
+the order, and training does not wait for hashes or the disk.
 """
 
 from collections.abc import Sequence
@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import RunError, one_line
-from purerl.runs import checkpoint, state_arrays
-from purerl.runs.loggers import BackgroundLogger, MetricsFile, Record, Say
+from purerl.runs import checkpoint, checkpoint_folder, state_arrays
+from purerl.runs.loggers import MetricsFile, Record, Say
 
 
-class Recorder:
+class RunWriter:
     """The only writer of a run's metrics.jsonl and checkpoints/."""
 
     def __init__(
@@ -22,44 +22,48 @@ class Recorder:
         folder: Path,
         offset: int,
         keep: int,
-        loggers: Sequence[BackgroundLogger],
         say: Say,
-        worker: ThreadPoolExecutor | None = None,
-        together: Sequence[Path] = (),
+        worker: ThreadPoolExecutor,
+        together: Sequence[Path],
     ) -> None:
-        """Cuts metrics.jsonl to `offset` [bytes] and clears what a crash left in checkpoints/.
+        """Cuts metrics.jsonl back and clears what a crash left in checkpoints/.
 
-        Seeds that train `together` (their checkpoint folders) share one `worker`: then none is
-        ever more than one checkpoint ahead of another, and all keep those they have in common.
+        Args:
+          folder: the run's.
+          offset: where metrics.jsonl is to go on [bytes].
+          keep: how many of the newest checkpoints stay.
+          say: prints a line.
+          worker: the one thread that writes. Seeds that train together share it, so that none is
+            ever more than one checkpoint ahead of another.
+          together: the checkpoint folders of the seeds that train together, this one's included.
+            They keep the checkpoints that all of them have.
         """
         self.checkpoints = folder / "checkpoints"
         self.checkpoints.mkdir(exist_ok=True)
-        checkpoint.clean(self.checkpoints)
+        checkpoint_folder.clean(self.checkpoints)
         self.metrics = MetricsFile(folder / "metrics.jsonl", offset)
         self.keep, self.say = keep, say
-        self.loggers: list[Any] = list(loggers)  # BackgroundLogger or RunVideo
-        self.worker = worker or ThreadPoolExecutor(1, "purerl-recorder")
-        self.together = together
+        self.loggers: list[Any] = []  # BackgroundLogger or RunVideo
+        self.worker, self.together = worker, together
         self.last: Future[None] | None = None
         self.saving: Future[None] | None = None
-        self.saved: int | None = None  # update of the newest checkpoint written here
-        self.digest: str | None = None  # of that checkpoint
+        self.digest: str | None = None  # of the newest checkpoint written here
         self.failures = 0
         self.last_failed = False  # whether the newest attempt to save failed
 
     def write(self, record: Record) -> None:
-        """Appends a line to metrics.jsonl, soon, and hands it to the loggers."""
+        """Hands a line to the loggers, and to the thread that appends it to metrics.jsonl."""
         self._submit(self._write, record)
 
     def save(
         self, record: Record, leaves: state_arrays.Leaves, meta: dict[str, Any], planned: bool
     ) -> None:
-        """Like `write`, then saves a checkpoint; waits only while the one before is being written.
+        """Writes a line and saves a checkpoint; waits only while the last one is being written.
 
         Args:
-          record: the line; it gets the state's digest when the checkpoint is a planned one. (One
-            taken because of a signal must leave no trace in metrics.jsonl.)
-          leaves: `snapshot.flatten` of the state.
+          record: the line. A planned checkpoint adds the state's digest to it. (One that a signal
+            asked for must leave no trace in metrics.jsonl.)
+          leaves: `state_arrays.flatten` of the state.
           meta: what the checkpoint should say besides digest and length of metrics.jsonl.
           planned: whether the run would have saved here without being interrupted.
         """
@@ -108,8 +112,8 @@ class Recorder:
             offset = self.metrics.append(record | {"digest": digest} if planned else record)
             meta = meta | {"digest": digest, "metrics_bytes": offset}
             checkpoint.save(self.checkpoints, leaves, meta)
-            self.saved, self.digest, self.last_failed = meta["update"], digest, False
-            checkpoint.retain(self.checkpoints, self.keep, self.together)
+            self.digest, self.last_failed = digest, False
+            checkpoint_folder.retain(self.checkpoints, self.keep, self.together)
         except Exception as error:  # Orbax reports a full disk as any of several kinds
             what = f"The checkpoint of update {meta['update']} could not be saved"
             self._failed(f"{what}: {one_line(error)[:300]}. The newest is {self._newest()}.")
@@ -119,5 +123,5 @@ class Recorder:
         self.say(f"{message} Training goes on.")
 
     def _newest(self) -> str:
-        found = checkpoint.updates(self.checkpoints)
+        found = checkpoint_folder.updates(self.checkpoints)
         return f"of update {found[-1]}" if found else "none"

@@ -17,11 +17,11 @@ from typing import Any
 import jax
 
 from purerl.devices import programs
+from purerl.devices.compilation import set_up_jax
 from purerl.ppo import algorithm
 from purerl.run import from_command_line
 from purerl.runs import build_experiment, checkpoint, console, experiment, state_arrays
 from purerl.runs.command_line import parse
-from purerl.runs.session import set_up_jax
 
 TIMES = 5
 

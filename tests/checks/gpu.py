@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from purerl.report import run_reader
-from purerl.report.run_reader import History
+from purerl.report.run_reader import RunRecord
 
 FLAGS = {
     "as it is": "",
@@ -95,7 +95,7 @@ def make(variant: str, words: list[str], runs: Path, name: str) -> Result:
 
 def run_quietly(
     program: list[str], words: list[str], runs: Path, name: str, environment: dict[str, str]
-) -> History:
+) -> RunRecord:
     """Makes a run in a process of its own, in so changed an environment; ends all if it fails."""
     done = subprocess.run(
         [sys.executable, *program, *words, *QUIET, "--runs", str(runs), "--name", name],
@@ -106,7 +106,7 @@ def run_quietly(
     return run_reader.read(next(runs.glob(f"*/{name}")))
 
 
-def speed(run: History) -> float:
+def speed(run: RunRecord) -> float:
     """Returns a run's control steps per second after its first quarter."""
     start, end = run.lines[len(run.lines) // 4], run.lines[-1]
     seconds = end["wall_s"] - start["wall_s"]

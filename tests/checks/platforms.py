@@ -21,11 +21,11 @@ import jax
 import numpy as np
 
 from purerl import exact, run
-from purerl.core.errors import leave
 from purerl.core.records import PyTree
 from purerl.ppo import algorithm
 from purerl.runs import build_experiment, command_line, state_arrays
 from purerl.runs.build_experiment import Setup
+from purerl.runs.command_errors import leave
 from purerl.runs.experiment import find
 
 ROWS = 12  # shown

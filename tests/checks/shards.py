@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from purerl.report import bit_diff
-from purerl.report.run_reader import History
+from purerl.report.run_reader import RunRecord
 from tests.checks.gpu import run_quietly, speed
 
 FIND = "import jax; print(jax.default_backend(), jax.device_count())"
@@ -73,7 +73,7 @@ def show(devices: int, on_gpus: bool, most: int) -> dict[str, str]:
     return {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip(), "NPROC": str(most)}
 
 
-def figures(run: History) -> list[dict[str, Any]]:
+def figures(run: RunRecord) -> list[dict[str, Any]]:
     """Returns a run's metrics and digests without the clock."""
     return [line | {"wall_s": 0} for line in run.lines]
 

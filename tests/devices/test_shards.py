@@ -19,7 +19,7 @@ from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
 from purerl.devices import programs, shards
 from purerl.exact import pallas_calls, xla_flags
 from purerl.ppo.config import Evaluation
-from purerl.runs import build_experiment, checkpoint
+from purerl.runs import build_experiment, checkpoint_folder
 from tests.runs import toy_experiment
 from tests.runs.test_run import ROOT, TOY
 
@@ -104,8 +104,8 @@ def test_a_run_goes_on_with_another_number_of_devices(toy, tmp_path):
     words = [str(TOY), "--ppo.num-envs", "16", "--checkpoints", "3"]
     start(tmp_path, 4, *words, "--num-shards", "8")
     folder = tmp_path / "toy_experiment" / "seed1"
-    last = checkpoint.updates(folder / "checkpoints")[-1]
-    checkpoint.discard(folder / "checkpoints" / f"{last:012d}")
+    last = checkpoint_folder.updates(folder / "checkpoints")[-1]
+    checkpoint_folder.discard(folder / "checkpoints" / f"{last:012d}")
     said = start(tmp_path, 2, *words, "--resume")
     assert "Resuming after update" in said and "4 on a device" in said
     assert lines(folder) == lines(toy)

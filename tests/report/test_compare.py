@@ -2,6 +2,8 @@
 
 import csv
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,8 @@ from scipy import stats
 from purerl import compare, run
 from purerl.core.errors import FAILURE, USAGE
 
-TOY = Path(__file__).parent.parent / "runs" / "toy_experiment.py"
+ROOT = Path(__file__).parent.parent.parent
+TOY = ROOT / "tests" / "runs" / "toy_experiment.py"
 PPO = {"num_steps": 400, "num_envs": 10, "rollout_length": 10, "num_minibatches": 1}
 UPDATES = 4
 
@@ -256,6 +259,21 @@ def test_real_runs_part_at_a_named_leaf(tmp_path, capsys):
     assert f"leaves differ in the checkpoint of update 10, the first {pair['leaves'][0]}" in said
 
 
+def test_runs_are_compared_without_jax(tmp_path):
+    """A laptop that only looks at runs, and a shell that only asks for --help, wait for no JAX."""
+    make_seeds(tmp_path / "runs", "a", [1.0, 2.0], digests=["d1"])
+    make_run(tmp_path / "runs" / "again", 0, [1.0] * 4, digests=["e1"])  # the leaves are looked at
+    heavy = "('jax', 'jaxlib', 'flax', 'mujoco')"
+    code = (
+        "import sys; from purerl import compare; code = compare.main(sys.argv[1:]); "
+        f"assert not set({heavy}) & set(sys.modules); sys.exit(code)"
+    )
+    words = [sys.executable, "-c", code, str(tmp_path / "runs"), "--out", str(tmp_path / "out")]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (FAILURE, "")
+    assert "not at update 1" in done.stdout and (tmp_path / "out" / "curves.png").exists()
+
+
 # --- mistakes ---
 
 
@@ -266,8 +284,8 @@ def test_a_mistake_is_one_line(tmp_path, capsys):
         ([], "Give the runs"),
         ([str(tmp_path / "nowhere")], "no run"),
         ([str(tmp_path / "none*")], "no run"),
-        ([runs, "--metric", "eval/episode_retrun"], "Did you mean eval/episode_return?"),
-        ([runs, "--group-by", "ppo.lerning_rate"], "Did you mean ppo.learning_rate?"),
+        ([runs, "--metric", "eval/episode_retrun"], "Did you mean 'eval/episode_return'?"),
+        ([runs, "--group-by", "ppo.lerning_rate"], "Did you mean 'ppo.learning_rate'?"),
         ([runs, "--metrik", "x"], "--metric"),
     ]:
         assert compare.main(words) == USAGE, words

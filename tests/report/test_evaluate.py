@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,7 +12,7 @@ import pytest
 
 from purerl import evaluate, run
 from purerl.core.errors import USAGE
-from purerl.runs import checkpoint
+from purerl.runs import checkpoint_folder
 
 TOY = Path(__file__).parent.parent / "runs" / "toy_experiment.py"
 ROOT = TOY.parent.parent
@@ -74,7 +75,7 @@ def test_equal_seeds_give_equal_episodes(trained, tmp_path):
 
 
 def test_a_checkpoint_can_be_chosen(trained, tmp_path, capsys):
-    updates = checkpoint.updates(trained / "checkpoints")
+    updates = checkpoint_folder.updates(trained / "checkpoints")
     assert result(trained, tmp_path, "--checkpoint", str(updates[0]))["update"] == updates[0]
     assert result(trained, tmp_path, "--checkpoint", "best")["update"] in updates
     assert evaluate.main([str(trained), "--checkpoint", "5000"]) == USAGE
@@ -104,7 +105,7 @@ def test_a_mistake_is_one_line(words, capsys):
 
 def test_settings_that_do_not_fit_the_file_are_named(trained, tmp_path, capsys):
     copy = tmp_path / "run"
-    checkpoint.shutil.copytree(trained, copy)
+    shutil.copytree(trained, copy)
     settings = json.loads((copy / "config.json").read_text())
     settings["settings"]["env"]["gravity"] = 9.81
     (copy / "config.json").write_text(json.dumps(settings))

@@ -2,6 +2,7 @@
 
 import errno
 import hashlib
+import shutil
 from pathlib import Path
 
 import jax
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from purerl.core.errors import UserError
-from purerl.runs import array_files, checkpoint, state_arrays
+from purerl.runs import array_files, checkpoint, checkpoint_folder, state_arrays
 
 
 def make_state(number: float = 1.0):
@@ -91,7 +92,7 @@ def test_a_flipped_bit_is_noticed_and_its_leaf_named(tmp_path, monkeypatch):
         return leaves
 
     monkeypatch.setattr(array_files, "read", flipped)
-    with pytest.raises(checkpoint.DamagedError, match="params/w.x"):
+    with pytest.raises(checkpoint_folder.DamagedError, match="params/w.x"):
         checkpoint.load(path, abstract())
 
 
@@ -107,7 +108,7 @@ def test_no_flipped_bit_of_any_array_file_loads_as_something_else(tmp_path):
         file.write_bytes(damaged)
         try:
             assert state_arrays.digest(checkpoint.load(path, abstract()).state) == good
-        except checkpoint.DamagedError:
+        except checkpoint_folder.DamagedError:
             noticed += 1
     assert noticed > 0
 
@@ -127,7 +128,7 @@ def damage_no_meta(path: Path):
 
 
 def damage_empty(path: Path):
-    checkpoint.shutil.rmtree(path)
+    shutil.rmtree(path)
     path.mkdir()
 
 
@@ -136,18 +137,18 @@ def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_used(tmp_path, dam
     save(tmp_path, 1)
     damage(save(tmp_path, 2))
     said = []
-    saved = checkpoint.newest(tmp_path, abstract(), said.append)
+    (saved,) = checkpoint.newest([tmp_path], abstract(), said.append)
     assert saved.meta["update"] == 1
     assert state_arrays.digest(saved.state) == state_arrays.digest(make_state(1.0))
     assert len(said) == 1 and "update 2" in said[0] and "damaged-0-000000000002" in said[0]
-    assert checkpoint.updates(tmp_path) == [1]
+    assert checkpoint_folder.updates(tmp_path) == [1]
     assert (tmp_path / "damaged-0-000000000002").is_dir()
 
 
 def test_a_reader_sets_nothing_aside(tmp_path):
     damage_cut(save(tmp_path, 2))
-    assert checkpoint.newest(tmp_path, abstract(), lambda line: None, set_aside=False) is None
-    assert checkpoint.updates(tmp_path) == [2]
+    assert checkpoint.newest([tmp_path], abstract(), print, rename=False) == []
+    assert checkpoint_folder.updates(tmp_path) == [2]
 
 
 def test_another_state_is_refused_with_the_leaf(tmp_path):
@@ -160,9 +161,9 @@ def test_another_state_is_refused_with_the_leaf(tmp_path):
 def test_the_newest_and_the_best_are_kept(tmp_path):
     for update, score in [(1, None), (2, 9.0), (3, 1.0), (4, None), (5, 2.0)]:
         save(tmp_path, update, score=score)
-    checkpoint.retain(tmp_path, 2)
-    assert checkpoint.updates(tmp_path) == [2, 4, 5]
-    assert checkpoint.best_update(tmp_path) == 2
+    checkpoint_folder.retain(tmp_path, 2)
+    assert checkpoint_folder.updates(tmp_path) == [2, 4, 5]
+    assert checkpoint_folder.best_update(tmp_path) == 2
     assert not list(tmp_path.glob(".deleting*"))
 
 
@@ -173,15 +174,17 @@ def test_of_seeds_together_those_are_kept_that_all_have(tmp_path):
     for update in (1, 2):
         save(behind, update)
     for folder in (ahead, behind):
-        checkpoint.retain(folder, 1, [ahead, behind])
-    assert checkpoint.updates(ahead) == [2, 3, 4] and checkpoint.updates(behind) == [2]
-    found = checkpoint.newest_of_all([ahead, behind], abstract(), print)
+        checkpoint_folder.retain(folder, 1, [ahead, behind])
+    assert checkpoint_folder.updates(ahead) == [2, 3, 4] and checkpoint_folder.updates(behind) == [
+        2
+    ]
+    found = checkpoint.newest([ahead, behind], abstract(), print)
     assert [saved.meta["update"] for saved in found] == [2, 2]
-    checkpoint.forget_after(ahead, 2)
-    assert checkpoint.updates(ahead) == [2]
+    checkpoint_folder.forget_after(ahead, 2)
+    assert checkpoint_folder.updates(ahead) == [2]
     damage_cut(behind / f"{2:012d}")
-    assert checkpoint.newest_of_all([ahead, behind], abstract(), print) == []
-    assert checkpoint.updates(ahead) == [2]
+    assert checkpoint.newest([ahead, behind], abstract(), print) == []
+    assert checkpoint_folder.updates(ahead) == [2]
 
 
 def test_a_failed_save_leaves_nothing_and_the_older_one_whole(tmp_path, monkeypatch):

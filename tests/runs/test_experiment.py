@@ -39,7 +39,7 @@ def test_an_unknown_experiment_is_one_line(place, name):
         experiment.find(name)
     assert "\n" not in str(error.value)
     if name == "hoper":
-        assert "Did you mean hopper?" in str(error.value)
+        assert "Did you mean 'hopper'?" in str(error.value)
 
 
 def test_a_mistake_in_the_file_names_its_line(tmp_path):
@@ -125,7 +125,7 @@ def test_missing_and_unknown_settings_are_named():
         experiment.from_json(chosen, values)
     values = experiment.to_json(chosen)
     values["ppo"]["learning_rat"] = 1.0
-    with pytest.raises(UserError, match="ppo.learning_rat'.*Did you mean ppo.learning_rate"):
+    with pytest.raises(UserError, match="ppo.learning_rat'.*Did you mean 'ppo.learning_rate"):
         experiment.from_json(chosen, values)
 
 

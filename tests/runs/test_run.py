@@ -26,16 +26,17 @@ from purerl.ppo.config import Evaluation
 from purerl.runs import (
     build_experiment,
     checkpoint,
+    checkpoint_folder,
+    command_errors,
     console,
-    loop,
     run_folder,
     state_arrays,
     writer,
 )
-from purerl.runs.experiment import find, load
+from purerl.runs.experiment import find
 
 TOY = Path(__file__).parent / "toy_experiment.py"
-ROOT = TOY.parent.parent
+ROOT = TOY.parent.parent.parent
 LONG = ["--ppo.num-steps", "6400", "--checkpoints", "20"]  # 200 updates: seconds
 
 
@@ -75,7 +76,7 @@ def wait_for(condition, process: subprocess.Popen, timeout: float = 60.0) -> Non
 
 
 def checkpoints(runs: Path) -> list[int]:
-    return checkpoint.updates(folder(runs) / "checkpoints")
+    return checkpoint_folder.updates(folder(runs) / "checkpoints")
 
 
 class Stopper:
@@ -117,7 +118,7 @@ def test_a_run_writes_what_it_should_and_no_more_steps_than_promised(whole):
     assert [line["update"] for line in written if "digest" in line] == [3, 6, 9, 12]
     assert [line["update"] for line in written if "eval/episode_return" in line] == [6, 12]
     assert written[-1]["eval/episode_length"] == 4.0
-    saved = checkpoint.load_meta(folder(whole) / "checkpoints" / f"{12:012d}")
+    saved = checkpoint_folder.load_meta(folder(whole) / "checkpoints" / f"{12:012d}")
     assert saved["digest"] == digest(whole) and saved["steps"] == 384
     assert saved["metrics_bytes"] == (folder(whole) / "metrics.jsonl").stat().st_size
     assert (folder(whole) / "experiment.py").read_text() == TOY.read_text()
@@ -476,7 +477,7 @@ def test_ctrl_c_before_anything_has_begun_is_no_traceback():
         raise KeyboardInterrupt
 
     with pytest.raises(SystemExit) as ended:
-        errors.leave(interrupted)
+        command_errors.leave(interrupted)
     assert ended.value.code == 128 + signal.SIGINT
 
 
@@ -485,7 +486,7 @@ def test_an_error_of_any_command_is_one_line_and_its_code(capsys):
         raise errors.UserError("Give a run.")
 
     with pytest.raises(SystemExit) as ended:
-        errors.leave(mistaken)
+        command_errors.leave(mistaken)
     assert ended.value.code == USAGE and capsys.readouterr().err == "purerl: Give a run.\n"
 
 
@@ -553,24 +554,6 @@ def test_help_needs_no_jax():
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "--resume" in done.stdout and "Exit codes" in done.stdout
-
-
-@pytest.mark.parametrize("number", [0, 1, 3, 7, 50])
-@pytest.mark.parametrize("every", [1, 4, 9, 20])
-def test_events_are_spread_over_the_run_and_end_with_it(number, every):
-    ticks = loop.evenly(number, 20, every)
-    assert all(tick % every == 0 or tick == 20 for tick in ticks)
-    assert list(ticks) == sorted(set(ticks)) and len(ticks) <= number
-    assert ticks[-1:] == ((20,) if number else ())
-    if every == 1 and number == 7:
-        assert ticks == (3, 6, 9, 12, 15, 18, 20)
-
-
-def test_the_plan_never_exceeds_the_budget():
-    config = load(TOY).experiment.ppo
-    plan = loop.make_plan(config, Evaluation(), 0, 0)
-    assert plan.steps == 384 <= config.num_steps < 384 + plan.steps_per_update
-    assert plan.checkpoints == (12,)
 
 
 def test_the_second_signal_ends_at_once(monkeypatch, capsys):

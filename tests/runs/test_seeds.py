@@ -10,7 +10,7 @@ import pytest
 from purerl import run
 from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE, RunError, UserError
 from purerl.devices import programs
-from purerl.runs import checkpoint, loop, session, state_arrays, writer
+from purerl.runs import checkpoint, checkpoint_folder, loop, session, state_arrays, writer
 from tests.runs.test_run import ROOT, TOY, Stopper, digest, folder, lines, start
 
 CARTPOLE = ["--ppo.num-envs", "4", "--ppo.rollout-length", "8", "--ppo.num-steps", "128"]
@@ -43,7 +43,7 @@ def stop_after(monkeypatch):
 
 
 def kept(runs: Path, seed: str) -> list[int]:
-    return checkpoint.updates(folder(runs, seed) / "checkpoints")
+    return checkpoint_folder.updates(folder(runs, seed) / "checkpoints")
 
 
 def test_a_mapped_seed_that_fails_is_told_before_the_next_one(tmp_path, monkeypatch, capsys):
@@ -163,7 +163,7 @@ def test_a_lost_seed_is_named(tmp_path, stop_after, capsys):
     stop_after(10)
     start(tmp_path, *THREE)
     path = folder(tmp_path, "seed2") / "checkpoints" / f"{6:012d}"
-    meta = checkpoint.load_meta(path)
+    meta = checkpoint_folder.load_meta(path)
     from purerl.runs.run_folder import restore
 
     setup = restore(folder(tmp_path, "seed2"), "latest", print).setup

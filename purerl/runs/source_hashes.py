@@ -1,0 +1,143 @@
+"""Hashes of the source that decides a run's bits, for the manifest."""
+
+import ast
+import contextlib
+import functools
+import hashlib
+import importlib.util
+import os
+import sys
+import sysconfig
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+PACKAGE = Path(__file__).parent.parent
+AFTERWARDS = {"report"}  # rooms that only look at what a run has written
+
+
+def source_hashes(builders: Iterable[Callable], package: Path = PACKAGE) -> dict[str, str]:
+    """Returns a short sha256 of each source file that may decide a run's bits, by module.
+
+    The rule: every Python file of this package counts, but for the commands and the rooms in
+    AFTERWARDS. So does every Python file that the builders import, installed packages excepted,
+    with the bodies (`assets/*.xml`) beside it. A new module or room counts by itself.
+
+    Args:
+      builders: functions (build_env, build_network) whose imports are part of the run.
+      package: the folder of this package's source.
+    """
+    files = package_files(package) | imported_files(module_of(builder) for builder in builders)
+    folders = {file.parent.parent / "assets" for file in files.values()}
+    bodies = {f"assets/{f.name}": f for folder in folders for f in folder.rglob("*.xml")}
+    # By name, not by place: a moved checkout is the same source.
+    return {
+        name: hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+        for name, file in sorted((files | bodies).items())
+    }
+
+
+def package_files(package: Path) -> dict[str, Path]:
+    """Returns module name -> file of this package, without commands and the rooms in AFTERWARDS.
+
+    The files are read from the folder that this very file is in. What `import purerl` finds may be
+    another folder of that name, such as the one that holds the checkout.
+    """
+    found = {}
+    for file in package.rglob("*.py"):
+        room, *inside = file.relative_to(package).with_suffix("").parts
+        if room not in AFTERWARDS if inside else room == "__init__":
+            found[".".join((package.name, room, *inside)).removesuffix(".__init__")] = file
+    return found
+
+
+def module_of(builder: Callable) -> str:
+    """Returns the module that a function, or what wraps it as a partial, comes from."""
+    while isinstance(builder, functools.partial):
+        builder = builder.func
+    return builder.__module__
+
+
+def imported_files(names: Iterable[str]) -> dict[str, Path]:
+    """Returns module name -> file, of the modules `names` and all they import.
+
+    Other packages' files count unless they are installed: those have a version. This package's do
+    not: `package_files` lists them.
+    """
+    todo = list(names)
+    ours = {name.partition(".")[0]: True for name in todo} | {PACKAGE.name: False}
+    installed = installed_folders()
+    found: dict[str, Path] = {}
+    while todo:
+        name = todo.pop()
+        package, _, inside = name.partition(".")
+        if package not in ours:
+            ours[package] = not _is_within(package, installed)
+        file = module_file(name) if ours[package] and name not in found else None
+        if file is not None and file.suffix == ".py":
+            found[name] = file
+            todo += _imports(name, file)
+            if inside:  # Python runs a package's __init__.py first
+                todo.append(name.rpartition(".")[0])
+    return found
+
+
+def _is_within(package: str, folders: set[Path]) -> bool:
+    """Tells whether a package is in one of the folders, or nowhere."""
+    file = module_file(package)
+    if file is not None:
+        return not folders.isdisjoint(file.parents)
+    spec = importlib.util.find_spec(package) if package != "__main__" else None
+    places = (spec and spec.submodule_search_locations) or []  # of a package without __init__.py
+    return all(not folders.isdisjoint(Path(place).absolute().parents) for place in places)
+
+
+def installed_folders() -> set[Path]:
+    """Returns where Python and installed packages are: beside a package there is its metadata."""
+    places = {Path(place).absolute() for place in sys.path}
+    return {*filter(_holds_packages, places), Path(sysconfig.get_path("stdlib"))}
+
+
+def _holds_packages(folder: Path) -> bool:
+    try:
+        return any(name.endswith(".dist-info") for name in os.listdir(folder))
+    except PermissionError:  # whatever is in it, it cannot be this process's own source
+        return True
+    except OSError:  # an archive, or nothing
+        return False
+
+
+def module_file(name: str) -> Path | None:
+    """Returns a module's Python file; None for what is no module, such as an imported function.
+
+    Imports nothing: `find_spec` of a dotted name would import the module before the dot, and with
+    that of an engine all of MJX or Warp.
+    """
+    if name in sys.modules:
+        spec = getattr(sys.modules[name], "__spec__", None)
+        # A run's copy of an experiment says in `__file__` where the original is.
+        file = spec.origin if spec and spec.has_location else None
+        file = file or getattr(sys.modules[name], "__file__", None)
+        return Path(file) if file else None
+    package, *inside = name.split(".")
+    spec = importlib.util.find_spec(package)
+    if spec is None:
+        return None
+    if not inside:
+        return Path(spec.origin) if spec.has_location and spec.origin else None
+    places = [Path(place, *inside) for place in spec.submodule_search_locations or ()]
+    files = [file for place in places for file in (place / "__init__.py", place.with_suffix(".py"))]
+    return next((file for file in files if file.is_file()), None)
+
+
+def _imports(module: str, file: Path) -> list[str]:
+    """Returns every name that a module's import statements may mean as a module."""
+    package = module if file.name == "__init__.py" else module.rpartition(".")[0]
+    names: list[str] = []
+    for node in ast.walk(ast.parse(file.read_bytes())):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            with contextlib.suppress(ImportError):  # `from . import x` outside of any package
+                place = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
+                names += [place, *(f"{place}.{alias.name}" for alias in node.names)]
+    return names
