@@ -41,63 +41,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        options = parse(Options, arguments, "python -m purerl.evaluate")
-        print("\n".join(describe(evaluate_run(options))))
+        print("\n".join(describe(command(parse(Options, arguments, "python -m purerl.evaluate")))))
     except UserError as error:
         return tell(error)
     return 0
 
 
-def evaluate_run(options: Options) -> dict[str, Any]:
-    """Evaluates and returns the result: for each metric mean, std, min, max and every value."""
-    import jax
-    import numpy as np
+def command(options: Options) -> dict[str, Any]:
+    """Evaluates, writes the file that was asked for, and returns the result."""
+    from purerl.runs.loaded_run import load
 
-    from purerl.core.keys import Purpose, derive
-    from purerl.devices.compilation import set_up_jax
-    from purerl.ppo.evaluation import evaluate
-    from purerl.runs.run_folder import restore
-
-    if options.episodes < 1:
-        raise UserError(f"episodes is {options.episodes}; it must be at least 1.")
-    if options.json is not None and not options.json.absolute().parent.is_dir():
-        raise UserError(f"{options.json} cannot be written: there is no such folder.")
-    set_up_jax(cache=True)
-    run = restore(options.run, options.checkpoint, lambda line: print(line), options.engine)
-    config, env, network, engine = run.setup
-
-    def judge(state: Any, key: Any) -> dict[str, Any]:
-        return evaluate(
-            config, env, network, state, key, options.episodes, not options.stochastic
-        )  # fmt: skip
-
-    key = derive(jax.random.key(options.seed), Purpose.EVALUATION)
-    values = jax.device_get(jax.jit(judge)(run.saved.state, key))
-    result = {
-        "run": str(options.run),
-        "update": run.saved.meta["update"],
-        "steps": run.saved.meta["steps"],
-        "digest": run.saved.meta["digest"],
-        "engine": engine,
-        "seed": options.seed,
-        "policy": "stochastic" if options.stochastic else "deterministic",
-        "episodes": options.episodes,
-        "metrics": {name: statistics(np.asarray(x, float)) for name, x in sorted(values.items())},
-    }
-    if options.json is not None:
-        write(options.json, result)
+    file = options.json
+    if file is not None and not file.absolute().parent.is_dir():
+        raise UserError(f"{file} cannot be written: there is no such folder.")
+    run = load(options.run, options.checkpoint, options.engine)
+    result = run.evaluate(options.episodes, options.seed, options.stochastic)
+    try:
+        if file is not None:
+            file.write_text(json.dumps(result, indent=2) + "\n")
+    except OSError as error:
+        raise UserError(f"{file} cannot be written: {error.strerror}.") from error
     return result
-
-
-def statistics(values: Any) -> dict[str, Any]:
-    """Summarises one metric of all episodes, [N]; std is over the episodes (divided by N)."""
-    return {
-        "mean": float(values.mean()),
-        "std": float(values.std()),
-        "min": float(values.min()),
-        "max": float(values.max()),
-        "values": values.tolist(),
-    }
 
 
 def describe(result: dict[str, Any]) -> list[str]:
@@ -114,14 +78,6 @@ def describe(result: dict[str, Any]) -> list[str]:
             for name, s in ordered.items()
         ),
     ]
-
-
-def write(path: Path, result: dict[str, Any]) -> None:
-    """Writes the result as JSON."""
-    try:
-        path.write_text(json.dumps(result, indent=2) + "\n")
-    except OSError as error:
-        raise UserError(f"{path} cannot be written: {error.strerror}.") from error
 
 
 if __name__ == "__main__":

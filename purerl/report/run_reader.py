@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import UserError, one_line, unknown
+from purerl.runs.loaded_run import read_metrics
 from purerl.runs.loop import MAX_SKIPPED_IN_A_ROW
 from purerl.runs.run_folder import runs_in
 
@@ -89,7 +90,7 @@ def read(path: Path) -> History:
             settings=flatten(learning),
             manifest=_read_json(path / "manifest.json"),
             source=(path / "experiment.py").read_bytes(),
-            lines=_read_lines(path / "metrics.jsonl"),
+            lines=read_metrics(path / "metrics.jsonl"),
             planned=planned_updates(settings["ppo"]),
         )
     except (KeyError, TypeError, AttributeError) as error:
@@ -134,14 +135,3 @@ def _read_json(path: Path) -> Any:
         return json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read: {one_line(error)}") from error
-
-
-def _read_lines(path: Path) -> list[dict[str, Any]]:
-    """Reads whole lines; a run that is being written may end in half a line."""
-    if not path.exists():
-        return []
-    texts = path.read_text().split("\n")[:-1]
-    try:
-        return [json.loads(text) for text in texts]
-    except ValueError as error:
-        raise UserError(f"{path} has a line that is no JSON: {one_line(error)}") from error

@@ -7,13 +7,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from purerl.devices import compilation
-from purerl.ppo.config import Config
 from purerl.core.env import Env, EnvError, check_members, check_shapes
 from purerl.core.errors import RunError, UserError, one_line, own_line
-from purerl.runs.experiment import Experiment
-from purerl.ppo.networks import check_network
 from purerl.core.records import Network
+from purerl.devices import compilation
+from purerl.ppo.config import Config
+from purerl.ppo.networks import check_network
+from purerl.runs.experiment import Experiment
 
 
 class Setup(NamedTuple):

@@ -27,7 +27,7 @@ from purerl.runs.video_process import RunVideo
 from purerl.core.records import PyTree, TrainState
 
 if TYPE_CHECKING:
-    from purerl.run import Options
+    from purerl.runs.options import Options
 
 
 def train_together(

@@ -14,27 +14,20 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 
-from purerl.runs import build_experiment
-from purerl.runs import checkpoint
-from purerl.devices import compilation
-from purerl.runs import console
-from purerl.devices import processes
-from purerl.exact import xla_flags
-from purerl.runs import manifest
-from purerl.ppo import algorithm
-from purerl.runs import run_folder
-from purerl.devices import multi_device
-from purerl.runs import loop
-from purerl.ppo.config import Config
-from purerl.devices.processes import alone
 from purerl.core.errors import RunError, UserError
+from purerl.core.records import PyTree
+from purerl.devices import compilation, multi_device, processes
+from purerl.devices.processes import alone
+from purerl.devices.shards import Shards, check_sizes
+from purerl.exact import xla_flags
+from purerl.ppo import algorithm
+from purerl.ppo.config import Config
+from purerl.runs import build_experiment, checkpoint, console, loop, manifest, run_folder
 from purerl.runs.experiment import Evaluation, Experiment, Source
 from purerl.runs.seed_group import needed_loggers, train_together
-from purerl.devices.shards import Shards, check_sizes
-from purerl.core.records import PyTree
 
 if TYPE_CHECKING:
-    from purerl.run import Options
+    from purerl.runs.options import Options
 
 
 def execute(

@@ -13,8 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
-from purerl.runs import checkpoint
 from purerl.core.errors import one_line
+from purerl.runs import checkpoint
 
 LOWEST_PRIORITY = 19  # of a Unix process
 

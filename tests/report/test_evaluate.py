@@ -14,7 +14,7 @@ from purerl.core.errors import USAGE
 from purerl.runs import checkpoint
 
 TOY = Path(__file__).parent.parent / "runs" / "toy_experiment.py"
-ROOT = TOY.parent.parent
+ROOT = TOY.parent.parent.parent
 
 
 @pytest.fixture(scope="module")

@@ -158,7 +158,7 @@ def test_a_run_on_c_imports_no_other_engine():
     lines = [
         "import sys",
         "from purerl import building, experiment, manifest",
-        "chosen = experiment.find('ant_run').experiment",
+        "chosen = experiment.find('ant_run')",
         "setup = building.build(chosen)",
         "manifest.collect(setup.engine, [chosen.build_env, chosen.build_network])",
         "assert setup.engine == 'c'",

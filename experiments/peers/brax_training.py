@@ -1,10 +1,10 @@
 """brax's PPO beside ours: the whole training from cold, and the returns of several seeds.
 
-    python -m experiments.brax_training brax ant --seeds 0 1 2 3 4 --json brax_ant.json
-    python -m experiments.brax_training purerl ant --seeds 0 1 2 3 4 --json purerl_ant.json
-    python -m experiments.brax_training table brax_ant.json purerl_ant.json
+    python -m experiments.peers.brax_training brax ant --seeds 0 1 2 3 4 --json brax_ant.json
+    python -m experiments.peers.brax_training purerl ant --seeds 0 1 2 3 4 --json purerl_ant.json
+    python -m experiments.peers.brax_training table brax_ant.json purerl_ant.json
 
-Settings are those of `experiments/brax_peer.py`. One process trains with one trainer, so that
+Settings are those of `experiments/peers/brax_peer.py`. One process trains with one trainer, so that
 neither finds the machine warmed by the other, and brax keeps XLA's own choice of kernels. With
 `purerl on brax's physics` and `purerl` it is the first or the third line of that table.
 
@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from experiments.brax_peer import BODIES, Published, our_experiment, resize, train_brax
+from experiments.peers.brax_peer import BODIES, Published, our_experiment, resize, train_brax
 from purerl.core.errors import UserError, leave, output_file
 from purerl.devices import compilation
 from purerl.devices.compilation import Programs

@@ -1,10 +1,10 @@
 """brax's PPO beside ours, on brax's own bodies with brax's published settings: steps per second.
 
     python -m pip install -c constraints.txt -e '.[peers]'
-    python -m experiments.brax_peer ant humanoid --json rates.json
-    python -m experiments.brax_peer ant --trainers brax    # with XLA's own choice of kernels
+    python -m experiments.peers.brax_peer ant humanoid --json rates.json
+    python -m experiments.peers.brax_peer ant --trainers brax    # with XLA's own choice of kernels
 
-Same observation, reward, end and start (brax's code, `envs/brax_env.py`), networks, environments,
+Same observation, reward, end and start (brax's code, `experiments/peers/brax_env.py`), networks, environments,
 samples, minibatches and epochs; no evaluation and no checkpoint. Three lines of a table:
 
     brax                      its own figure, "training/sps", between calls of its progress function
@@ -16,7 +16,7 @@ observation, reward or network; brax's is that of the second line. What differs 
 each trainer does besides: ours draws a fresh start for each episode, takes MJX's matrix products in
 whole float32, and leaves no lambda out of the advantage.
 
-Whole training and its returns: `experiments/brax_training.py`.
+Whole training and its returns: `experiments/peers/brax_training.py`.
 """
 
 import argparse
@@ -32,10 +32,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from envs import brax_env
-from experiments import brax_network
-from experiments.benchmark import Part, measure
-from experiments.peers import Ours
+from experiments.benchmarks.benchmark import Part, measure
+from experiments.peers import brax_env, brax_network
+from experiments.peers.sb3 import Ours
 from purerl.core.errors import leave, output_file
 from purerl.core.records import Array, PyTree
 from purerl.devices import compilation
