@@ -15,7 +15,8 @@ An experiment:
 An environment:
   Env, State: the protocol, and one environment between two steps.
   check_env, EnvError: checks that an environment keeps to the protocol.
-  Physics, PhysicsState: MuJoCo on the engines c, jax and warp; choose_engine resolves "auto".
+  Physics, PhysicsState: MuJoCo on the engines c, jax and warp.
+  choose_engine: which engine "auto" is.
   lookup: a module: MuJoCo's names to indices, actions to controls.
   overflow_reading, overflow_metric: count contacts for which engine warp had no room.
 

@@ -1,8 +1,8 @@
 """Where time and memory go: physics, rollout, learner, update, evaluation of an experiment.
 
     python -m experiments.benchmarks.benchmark ant_run
-    python -m experiments.benchmarks.benchmark ant_run --engine jax --ppo.num-envs 4096 --json out.json
-    python -m experiments.benchmarks.benchmark ant_run --start-up    # from the command to the first update
+    python -m experiments.benchmarks.benchmark ant_run --engine jax --json out.json
+    python -m experiments.benchmarks.benchmark ant_run --start-up    # time to the first update
 
 Each part is compiled by itself and timed in rounds, part after part, so that a busy moment of the
 machine falls on all of them; the median of the rounds counts. Rates are control steps per second.

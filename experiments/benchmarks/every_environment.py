@@ -1,7 +1,7 @@
 """Every environment on every engine: does it keep the contract, and how fast is it?
 
     python -m experiments.benchmarks.every_environment
-    python -m experiments.benchmarks.every_environment --engines c --num-envs 64 --only rodent_gaps walker-walk
+    python -m experiments.benchmarks.every_environment --engines c --only rodent_gaps walker-walk
 
 A row has control steps/s of the bare engine under random controls, of the rollout (policy, reward,
 observations and resets included), and the rollout's share; both timed in turns in one process.

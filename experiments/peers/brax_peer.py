@@ -4,8 +4,9 @@
     python -m experiments.peers.brax_peer ant humanoid --json rates.json
     python -m experiments.peers.brax_peer ant --trainers brax    # with XLA's own choice of kernels
 
-Same observation, reward, end and start (brax's code, `experiments/peers/brax_env.py`), networks, environments,
-samples, minibatches and epochs; no evaluation and no checkpoint. Three lines of a table:
+Same observation, reward, end and start (brax's code, `experiments/peers/brax_env.py`), networks,
+environments, samples, minibatches and epochs; no evaluation and no checkpoint. Three lines of a
+table:
 
     brax                      its own figure, "training/sps", between calls of its progress function
     purerl on brax's physics  MJX as brax calls it, the whole `mjx.Data` carried from step to step
