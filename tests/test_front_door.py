@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -80,6 +81,11 @@ def test_the_commands_are_listed_a_line_each_and_called(capsys, tmp_path):
     assert "is no run" in capsys.readouterr().err
     assert commands.main(["evalute"]) == 2
     assert "Did you mean evaluate?" in capsys.readouterr().err
+
+
+def test_the_console_script_is_the_list_of_commands():
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    assert scripts == {"purerl": "purerl.__main__:console"} and callable(commands.console)
 
 
 @pytest.mark.parametrize(

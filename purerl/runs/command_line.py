@@ -10,7 +10,7 @@ from typing import Any
 
 import tyro
 
-from purerl.core.errors import UserError, unknown
+from purerl.core.errors import UserError
 from purerl.runs import experiment
 from purerl.runs.experiment import Experiment, Source
 from purerl.runs.options import Options
@@ -61,26 +61,8 @@ def from_settings(
       settings: "ppo.num_envs" -> value.
       options: "num_seeds" -> value.
     """
-    known = [
-        name for value in experiment.settings(source.experiment).items() for name in _names(*value)
-    ]
-    for kind, given, valid in (
-        ("setting", settings, known),
-        ("option", options, [f.name for f in dataclasses.fields(Options)]),
-    ):
-        for name in given:
-            if name not in valid:
-                raise unknown(kind, name, valid)
     words = [word for pair in (dict(settings) | dict(options)).items() for word in _words(*pair)]
     return from_command_line(source, words, f"python -m purerl.run {source.name}", WORDS)
-
-
-def _names(name: str, value: Any) -> list[str]:
-    """Returns the dotted names of a setting and of those inside it that can be given a value."""
-    if not dataclasses.is_dataclass(value):
-        return [name]
-    inner = [(f"{name}.{f.name}", getattr(value, f.name)) for f in dataclasses.fields(value)]
-    return [inside for pair in inner for inside in _names(*pair)]
 
 
 def _words(name: str, value: Any) -> list[str]:

@@ -80,6 +80,8 @@ class Source(NamedTuple):
     path: Path
 
 
+FOUND: list[Source] = []  # by `find`: so that `train` knows an experiment's file by its object
+
 # --- finding ---
 
 
@@ -124,7 +126,8 @@ def find(name: str) -> Experiment:
     >>> find("cartpole_swingup").ppo.num_envs
     64
     """
-    return find_source(name).experiment
+    FOUND.append(find_source(name))
+    return FOUND[-1].experiment
 
 
 def find_source(name: str) -> Source:

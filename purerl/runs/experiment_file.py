@@ -16,10 +16,9 @@ from typing import Any
 import purerl
 from purerl.core.errors import UserError
 from purerl.runs.experiment import (
-    BUILDERS,
+    FOUND,
     Experiment,
     Source,
-    defines_experiment,
     load,
     settings,
     to_json,
@@ -30,48 +29,24 @@ NAME = "experiment"  # names the folder under runs/ when no file does
 
 @contextmanager
 def source_of(experiment: Experiment) -> Iterator[Source]:
-    """Yields the file that defines this experiment, or one written for it, which then goes.
+    """Yields the file that this experiment was found in, or one written for it, which then goes.
 
     Raises:
       UserError: a builder or a class cannot be imported, or a value cannot be written down.
     """
-    found = defining_file(experiment)
-    if found is not None:
-        yield Source(experiment, found.stem, found)
-        return
+    for source in FOUND:
+        if source.experiment == experiment:
+            yield source
+            return
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"{NAME}.py"
         path.write_text(source_text(experiment))
-        read = load(path).experiment
-        if read != experiment:
+        if load(path).experiment != experiment:
             raise UserError(
-                "The experiment cannot be rebuilt from a file: its settings would be read back as "
-                f"{settings(read)}. Put the experiment into a .py file and give its path."
+                f"A file cannot rebuild {experiment}: the copy differs. Put the experiment into a "
+                ".py file, and give that file's path."
             )
         yield Source(experiment, NAME, path)
-
-
-def defining_file(experiment: Experiment) -> Path | None:
-    """Returns the file of an imported module whose `experiment` is this one; None without any."""
-    for name, module in list(sys.modules.items()):
-        other = vars(module).get("experiment") if hasattr(module, "__dict__") else None
-        # A script that trains would train again when it is read as a run's experiment.
-        if name == "__main__" or not isinstance(other, Experiment):
-            continue
-        if _identity(other) == _identity(experiment):
-            spec = module.__spec__
-            file = Path(spec.origin) if spec is not None and spec.origin else None
-            if file is not None and file.is_file() and defines_experiment(file):
-                return file
-    return None
-
-
-def _identity(experiment: Experiment) -> Any:
-    """Returns what two loads of one file have in common, and two files have not."""
-    builders = [getattr(experiment, name) for name in BUILDERS]
-    code = [getattr(getattr(b, "__code__", None), "co_filename", b) for b in builders]
-    names = [getattr(b, "__qualname__", b) for b in builders]
-    return code, names, to_json(settings(experiment))
 
 
 def source_text(experiment: Experiment) -> str:

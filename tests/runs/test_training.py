@@ -130,13 +130,13 @@ def test_it_trains_in_a_thread(trained, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "options", "message"),
     [
-        ({"ppo.num_step": 3}, {}, "no setting 'ppo.num_step'. Did you mean ppo.num_steps?"),
-        ({"ppo": 3}, {}, "no setting 'ppo'"),
+        ({"ppo.num_step": 3}, {}, "no option --ppo.num-step. Did you mean --ppo.num-steps?"),
+        ({"ppo": 3}, {}, "no option --ppo."),
         ({"ppo.num_steps": "many"}, {}, "num-steps: invalid literal"),
         ({"ppo.gamma": 1.5}, {}, "gamma is 1.5; it must be in [0, 1]"),
         ({"ppo.schedule": "cubic"}, {}, "Expected one of ('constant'"),
         ({"env.steps": None}, {}, "env.steps"),
-        ({}, {"num_seed": 2}, "no option 'num_seed'. Did you mean num_seeds?"),
+        ({}, {"num_seed": 2}, "no option --num-seed. Did you mean --num-seeds?"),
         ({}, {"keep": 0}, "keep is 0; it must be at least 1"),
         ({}, {"cache": "perhaps"}, "cache"),
         ({}, {"resume": True}, "There is no run"),
