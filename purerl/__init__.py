@@ -80,14 +80,16 @@ HOMES = {name: f"purerl.{home}" for home, names in _NAMES.items() for name in na
 __all__ = sorted(HOMES)
 
 
-def __getattr__(name: str) -> Any:
-    """Imports a public name when it is first used."""
-    if name not in HOMES:
-        raise AttributeError(f"purerl has no name {name!r}: {_hint(name)}")
-    module = importlib.import_module(HOMES[name])
-    found = module if HOMES[name].endswith(f".{name}") else getattr(module, name)
-    globals()[name] = found
-    return found
+if not TYPE_CHECKING:  # which would then know every name
+
+    def __getattr__(name: str) -> Any:
+        """Imports a public name when it is first used."""
+        if name not in HOMES:
+            raise AttributeError(f"purerl has no name {name!r}: {_hint(name)}")
+        module = importlib.import_module(HOMES[name])
+        found = module if HOMES[name].endswith(f".{name}") else getattr(module, name)
+        globals()[name] = found
+        return found
 
 
 def __dir__() -> list[str]:

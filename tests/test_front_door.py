@@ -40,7 +40,7 @@ def test_these_are_the_public_names():
 
 def test_editors_know_the_same_names_from_the_same_modules():
     tree = ast.parse(Path(purerl.__file__).read_text())
-    (block,) = [node for node in tree.body if isinstance(node, ast.If)]
+    block = next(node for node in tree.body if isinstance(node, ast.If))
     said = {}
     for node in block.body:
         for alias in node.names:

@@ -17,10 +17,10 @@ from typing import Any
 import jax
 
 from purerl.devices import compilation
+from purerl.devices.compilation import set_up_jax
 from purerl.ppo import algorithm
 from purerl.runs import build_experiment, checkpoint, console, experiment, state_arrays
 from purerl.runs.command_line import from_command_line
-from purerl.runs.session import set_up_jax
 
 TIMES = 5
 

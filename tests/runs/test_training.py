@@ -64,9 +64,10 @@ def written(folder: Path) -> dict:
 
 
 def test_it_makes_the_same_run_as_the_command(tmp_path):
-    """Each in a process of its own, as users have it; JAX is imported first in the one."""
+    """Each in a process of its own, as users have it; in the one, JAX has begun before."""
     script = (
         "import sys, jax, purerl\n"
+        "jax.numpy.ones(2).sum()\n"
         f"run = purerl.train(sys.argv[1], {SETTINGS}, runs=sys.argv[2], checkpoints=2)\n"
     )
     python = [sys.executable, "-c", script, str(TOY), str(tmp_path / "python")]
@@ -300,11 +301,16 @@ def test_a_run_from_before_the_move_is_one_line(trained, tmp_path, capsys):
     assert compare.main([str(old)]) == 0  # it reads what the run wrote, and nothing else
     assert len(purerl.load(old).metrics()["update"]) == 12
     capsys.readouterr()
+    facts = json.loads((old / "manifest.json").read_text())
+    facts["source"] = {f"purerl.old{i}": value for i, value in enumerate(facts["source"].values())}
+    (old / "manifest.json").write_text(json.dumps(facts))
     words = [str(TOY), *WORDS, "--runs", str(tmp_path), "--resume"]
     (tmp_path / "toy_experiment").mkdir()
     old.rename(tmp_path / "toy_experiment" / "seed3")
     assert run.main(words) == USAGE
-    assert "experiment.py: " in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "as of another version of purerl" in said and "train anew" in said
+    assert len(said.splitlines()) <= 5, said
 
 
 def test_types_of_settings_have_no_name_of_an_option():
