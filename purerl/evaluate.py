@@ -4,51 +4,35 @@ RUN is a run's folder; nothing else is needed, and nothing in it is changed.
 """
 
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-import tyro
-
-from purerl.core.errors import UserError, leave, tell
+from purerl.core.errors import UserError, leave
+from purerl.runs.command_line import carry_out
+from purerl.runs.options import PlayOptions
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(PlayOptions):
     """Evaluates a run's policy on whole episodes in fresh environments."""
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """The run's folder, such as runs/ant/seed1."""
     episodes: int = 100
     """Whole episodes, each in an environment of its own."""
-    seed: int = 0
-    """Seed of the episodes; never meets a seed of training."""
-    checkpoint: str = "latest"
-    """latest, best (highest evaluation return), or an update's number."""
     stochastic: bool = False
     """Sample actions instead of taking the distribution's centre."""
-    engine: Literal["", "auto", "c", "jax", "warp"] = ""
-    """Physics engine, where it should not be the run's own."""
     json: Path | None = None
     """Also write the result to this file as JSON, every episode's figures included."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    from purerl.runs.command_line import parse
-
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
-    try:
-        print("\n".join(describe(command(parse(Options, arguments, "python -m purerl.evaluate")))))
-    except UserError as error:
-        return tell(error)
-    return 0
+    return carry_out(Options, command, "python -m purerl.evaluate", arguments)
 
 
-def command(options: Options) -> dict[str, Any]:
-    """Evaluates, writes the file that was asked for, and returns the result."""
+def command(options: Options) -> None:
+    """Evaluates, writes the file that was asked for, and prints the figures."""
     from purerl.runs.loaded_run import load
 
     file = options.json
@@ -61,7 +45,7 @@ def command(options: Options) -> dict[str, Any]:
             file.write_text(json.dumps(result, indent=2) + "\n")
     except OSError as error:
         raise UserError(f"{file} cannot be written: {error.strerror}.") from error
-    return result
+    print("\n".join(describe(result)))
 
 
 def describe(result: dict[str, Any]) -> list[str]:

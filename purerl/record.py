@@ -22,45 +22,28 @@ What a module does inside Flax's own loops (`nn.scan`, `nn.vmap`) cannot be note
 """
 
 import os
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
 
-import tyro
-
-from purerl.core.errors import UserError, leave, tell
+from purerl.core.errors import UserError, leave
+from purerl.runs.command_line import carry_out
+from purerl.runs.options import PlayOptions
 
 
 @dataclass(frozen=True)
-class Options:  # noqa: D101 (--help prints the page above)
+class Options(PlayOptions):  # noqa: D101 (--help prints the page above)
     __doc__ = __doc__
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """The run's folder, such as runs/ant/seed1."""
     out: Path = Path("episodes.npz")
     """File to write."""
     episodes: int = 8
     """Whole episodes, N."""
-    seed: int = 0
-    """Seed of the episodes; never meets a seed of training."""
-    checkpoint: str = "latest"
-    """latest, best (highest evaluation return), or an update's number."""
-    engine: Literal["", "auto", "c", "jax", "warp"] = ""
-    """Physics engine, where it should not be the run's own."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    from purerl.runs.command_line import parse
-
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
-    try:
-        command(parse(Options, arguments, "python -m purerl.record"))
-    except UserError as error:
-        return tell(error)
-    return 0
+    return carry_out(Options, command, "python -m purerl.record", arguments)
 
 
 def command(options: Options) -> None:

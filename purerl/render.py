@@ -5,25 +5,18 @@ geometry that each episode really had; RUN/videos/<update>.png shows 16 moments 
 No screen is needed.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Literal
 
-import tyro
-
-from purerl.core.errors import RunError, UserError, leave, tell
+from purerl.core.errors import UserError, leave
+from purerl.runs.command_line import carry_out
+from purerl.runs.options import PlayOptions
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(PlayOptions):
     """Makes a video (mp4) and a contact sheet (PNG) of a run's policy, in RUN/videos/."""
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """The run's folder, such as runs/ant/seed1."""
-    checkpoint: str = "latest"
-    """latest, best (highest evaluation return), or an update's number."""
     camera: str = ""
     """A camera's name in the model; by default one that follows the body."""
     episodes: int = 1
@@ -32,23 +25,11 @@ class Options:
     """At most so much of each episode [s]."""
     size: str = "640x480"
     """Width x height of a frame [pixels], both even."""
-    seed: int = 0
-    """Seed of the episodes; never meets a seed of training."""
-    engine: Literal["", "auto", "c", "jax", "warp"] = ""
-    """Physics engine, where it should not be the run's own."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    from purerl.runs.command_line import parse
-
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
-    try:
-        options = parse(Options, arguments, "python -m purerl.render")
-        command(options)
-    except (UserError, RunError) as error:
-        return tell(error)
-    return 0
+    return carry_out(Options, command, "python -m purerl.render", arguments)
 
 
 def command(options: Options) -> None:

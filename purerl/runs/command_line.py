@@ -5,12 +5,13 @@ import dataclasses
 import enum
 import io
 import re
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import tyro
 
-from purerl.core.errors import UserError
+from purerl.core.errors import SUCCESS, RunError, UserError, tell
 from purerl.runs import experiment
 from purerl.runs.experiment import Experiment, Source
 from purerl.runs.options import Options
@@ -18,6 +19,24 @@ from purerl.runs.options import Options
 CONFIG = (tyro.conf.FlagCreatePairsOff,)
 # A flag takes a word, True or False, as every other option does.
 WORDS = (tyro.conf.FlagConversionOff,)
+
+
+def carry_out(
+    kind: Any, command: Callable[[Any], None], prog: str, arguments: Sequence[str] | None
+) -> int:
+    """Runs a command with its options; returns the exit code, an error being told in one line.
+
+    Args:
+      kind: the dataclass of its options.
+      command: called with them.
+      prog: the command's words, for the help page.
+      arguments: the command line; None: this process's.
+    """
+    try:
+        command(parse(kind, sys.argv[1:] if arguments is None else arguments, prog))
+    except (UserError, RunError) as error:
+        return tell(error)
+    return SUCCESS
 
 
 def from_command_line(

@@ -1,8 +1,24 @@
-"""The run command's options: how a run is made, kept and shown."""
+"""Options of commands: how a run is made, kept and shown, and how its policy is played."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass(frozen=True)
+class PlayOptions:
+    """Which run's policy is played, from which checkpoint, and where."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """The run's folder, such as runs/ant/seed1."""
+    checkpoint: str = "latest"
+    """latest, best (highest evaluation return), or an update's number."""
+    seed: int = 0
+    """Seed of the episodes; never meets a seed of training."""
+    engine: Literal["", "auto", "c", "jax", "warp"] = ""
+    """Physics engine, where it should not be the run's own."""
 
 
 @dataclass(frozen=True)
