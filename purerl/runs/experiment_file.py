@@ -41,7 +41,7 @@ def source_of(experiment: Experiment) -> Iterator[Source]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"{NAME}.py"
         path.write_text(source_text(experiment))
-        if load(path).experiment != experiment:
+        if to_json(settings(load(path).experiment)) != to_json(settings(experiment)):
             raise UserError(
                 f"A file cannot rebuild {experiment}: the copy differs. Put the experiment into a "
                 ".py file, and give that file's path."
@@ -89,7 +89,8 @@ def _importable(thing: Any, path: str, modules: set[str]) -> str:
     found: Any = sys.modules.get(module)
     for part in name.split("."):
         found = getattr(found, part, None)
-    if module == "__main__" or found is not thing:
+    code = [getattr(x, "__code__", None) for x in (found, thing)]  # a module may be loaded twice
+    if module == "__main__" or found is None or code[0] != code[1]:
         raise UserError(
             f"{path} is {name} of {module}, which a run's file cannot import: put it into a .py "
             "file of its own and import it from there, or give train that file's path."

@@ -239,8 +239,29 @@ def test_an_experiment_made_in_python_has_a_file_that_rebuilds_it(trained, tmp_p
     assert purerl.train(mine, SETTINGS, name="made", runs=tmp_path, resume=True).digest
 
 
+def test_an_experiment_whose_module_was_loaded_again_still_has_a_file(monkeypatch):
+    first = purerl.find("tests.runs.toy_experiment")
+    monkeypatch.delitem(sys.modules, "tests.runs.toy_experiment")
+    second = purerl.find("tests.runs.toy_experiment")
+    assert first.build_env is not second.build_env
+    for one in (first, second):
+        with experiment_file.source_of(dataclasses.replace(one, seed=7)) as source:
+            assert "import tests.runs.toy_experiment" in source.path.read_text()
+
+
 def local(*arguments):
     raise AssertionError
+
+
+def replaced(*arguments):
+    raise AssertionError
+
+
+was_replaced = replaced
+
+
+def replaced(*arguments):  # noqa: F811
+    raise ValueError
 
 
 def in_main(*arguments):
@@ -250,7 +271,9 @@ def in_main(*arguments):
 in_main.__module__ = "__main__"
 
 
-@pytest.mark.parametrize("build", [lambda *_: None, in_main, functools.partial(local)])
+@pytest.mark.parametrize(
+    "build", [lambda *_: None, in_main, functools.partial(local), was_replaced]
+)
 def test_a_builder_that_no_file_can_import_is_one_line(build, tmp_path):
     mine = dataclasses.replace(toy_experiment.experiment, build_env=build)
     with pytest.raises(purerl.UserError, match="build_env is .*put it into a .py file") as error:
