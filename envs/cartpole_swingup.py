@@ -11,10 +11,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from purerl.core.env import State
-from purerl.core.records import Array
-from purerl.physics import lookup
-from purerl.physics.interface import Physics, PhysicsState
+from purerl import Array, Physics, PhysicsState, State, lookup
 
 XML = Path(__file__).parent.parent / "assets" / "cartpole.xml"
 

@@ -14,9 +14,7 @@ from dm_control import mjcf
 
 from envs.arenas import GROUND, Arena, BoxFields, box_fields, build_arena, check_passable
 from envs.bodies import Body
-from purerl.core.errors import unknown_name
-from purerl.physics.interface import choose_engine
-from purerl.physics.lookup import find
+from purerl import choose_engine, lookup
 
 PREFIX = "walker/"  # composing puts it before the names of the body's parts
 TORSO_VELOCITY = "torso_velocity"  # a sensor of the walker's centre of mass [m/s]
@@ -85,7 +83,7 @@ def find_part(walker: mjcf.RootElement, kind: str, name: str) -> mjcf.Element:
     element = walker.find(kind, name)
     if element is None:
         names = [e.name for e in walker.find_all(kind) if e.name]
-        raise ValueError(unknown_name(kind, name, names))
+        raise ValueError(lookup.unknown_name(kind, name, names))
     return element
 
 
@@ -227,14 +225,16 @@ def check_contacts(model: mujoco.MjModel, body: Body) -> None:
 
 
 def _name_parts(model: mujoco.MjModel, body: Body, arena: Arena) -> Composed:
-    boxes = tuple(find(model, "geom", f"{GROUND}_{i}") for i in range(getattr(arena, "boxes", 0)))
+    boxes = tuple(
+        lookup.find(model, "geom", f"{GROUND}_{i}") for i in range(getattr(arena, "boxes", 0))
+    )
     free = mujoco.mjtJoint.mjJNT_FREE
     return Composed(
         model=model,
         body=body,
         arena=arena,
-        torso=find(model, "body", PREFIX + body.torso),
-        end_effectors=tuple(find(model, "body", PREFIX + n) for n in body.end_effectors),
+        torso=lookup.find(model, "body", PREFIX + body.torso),
+        end_effectors=tuple(lookup.find(model, "body", PREFIX + n) for n in body.end_effectors),
         joints=tuple(i for i in range(model.njnt) if model.jnt_type[i] != free),
         boxes=box_fields(model, boxes),
     )

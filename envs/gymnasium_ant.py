@@ -13,10 +13,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from purerl.core.env import State
-from purerl.core.records import Array
-from purerl.physics import lookup
-from purerl.physics.interface import Physics, PhysicsState
+from purerl import Array, Physics, PhysicsState, State, lookup
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,10 +24,7 @@ from envs.arenas import (
 )
 from envs.bodies import ANT, RODENT, Body
 from envs.compose import Composed, compose
-from purerl.core.env import State
-from purerl.core.records import Array
-from purerl.physics import lookup
-from purerl.physics.interface import Physics, PhysicsState, overflow_metric, overflow_reading
+from purerl import Array, Physics, PhysicsState, State, lookup, overflow_metric, overflow_reading
 
 BODIES = {"ant": ANT, "rodent": RODENT}
 READINGS = ("xpos", "xmat", "subtree_com", "actuator_force")

@@ -7,9 +7,7 @@ and 3: 16 gaps, 90% and 100%).
 """
 
 from envs import run
-from purerl.ppo import networks
-from purerl.ppo.config import Config, Evaluation
-from purerl.runs.experiment import Experiment
+from purerl import Config, Evaluation, Experiment, networks
 
 experiment = Experiment(
     build_env=run.build,

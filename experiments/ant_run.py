@@ -6,9 +6,7 @@ Expected: 4.5 m/s after 3.6 min, on two CPU cores (seeds 2 and 3: 4.5 and 4.6 m/
 """
 
 from envs import run
-from purerl.ppo import networks
-from purerl.ppo.config import Config, Evaluation
-from purerl.runs.experiment import Experiment
+from purerl import Config, Evaluation, Experiment, networks
 
 experiment = Experiment(
     build_env=run.build,

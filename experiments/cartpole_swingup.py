@@ -6,9 +6,7 @@ Expected: return 940 of 1000 after 14 s, on two CPU cores.
 """
 
 from envs import cartpole_swingup
-from purerl.ppo import networks
-from purerl.ppo.config import Config, Evaluation
-from purerl.runs.experiment import Experiment
+from purerl import Config, Evaluation, Experiment, networks
 
 experiment = Experiment(
     build_env=cartpole_swingup.build,

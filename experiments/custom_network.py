@@ -1,4 +1,4 @@
-"""Your own Flax network, in this one file: nothing to register, nothing in `purerl` to change.
+"""Your own Flax network, in this one file: nothing to register.
 
 python -m purerl.run experiments/custom_network.py                    # train
 python -m purerl.run experiments/custom_network.py --resume           # go on after a stop
@@ -12,10 +12,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 from envs import cartpole_swingup
-from purerl.core.records import Array, Network, Normal, PolicyOutput
-from purerl.ppo.config import Config
-from purerl.ppo.networks import from_linen
-from purerl.runs.experiment import Experiment
+from purerl import Array, Config, Experiment, Network, Normal, PolicyOutput, networks
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,8 +42,8 @@ class Residual(nn.Module):  # any module: observations [..., O] in, PolicyOutput
 
 
 def build_network(options: Options, observation: Array, action_size: int) -> Network:
-    """`observation` is an example, zeros [O]; for memory, see `from_linen` and `recurrent`."""
-    return from_linen(Residual(options, action_size), observation)
+    """`observation` is an example, zeros [O]; for memory, see `networks.recurrent`."""
+    return networks.from_linen(Residual(options, action_size), observation)
 
 
 experiment = Experiment(

@@ -15,9 +15,7 @@ python -m purerl.run rodent_gaps --engine warp --ppo.num-envs 4096 --ppo.rollout
 """
 
 from envs import run
-from purerl.ppo import networks
-from purerl.ppo.config import Config, Evaluation
-from purerl.runs.experiment import Experiment
+from purerl import Config, Evaluation, Experiment, networks
 
 experiment = Experiment(
     build_env=run.build,

@@ -6,9 +6,7 @@ Expected: return 600 of 1000 after 3 min, on two CPU cores; the other tasks: doc
 """
 
 from envs.suite import tasks
-from purerl.ppo import networks
-from purerl.ppo.config import Config, Evaluation
-from purerl.runs.experiment import Experiment
+from purerl import Config, Evaluation, Experiment, networks
 
 experiment = Experiment(
     build_env=tasks.build,

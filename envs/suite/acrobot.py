@@ -9,8 +9,7 @@ from dm_control.suite import acrobot
 
 from envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, make_env
 from envs.suite.rewards import tolerance
-from purerl.core.records import Array
-from purerl.physics import lookup
+from purerl import Array, lookup
 
 MARGINS = {"swingup": 1.0, "swingup_sparse": 0.0}  # of the tip's distance to the target [m]
 READINGS = ("xmat", "site_xpos")

@@ -15,9 +15,7 @@ from envs.suite.base import (
     make_env,
     touching_pairs,
 )
-from purerl.core.records import Array
-from purerl.physics import lookup
-from purerl.physics.interface import Physics
+from purerl import Array, Physics, lookup
 
 CANDIDATES = 8  # starting places to draw, to have one in which the ball touches nothing
 READINGS = ("xpos", "site_xpos")

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from purerl.core.env import State
-from purerl.core.records import Array
-from purerl.physics import lookup
-from purerl.physics.interface import (
+from purerl import (
+    Array,
     Physics,
     PhysicsState,
+    State,
     choose_engine,
+    lookup,
     overflow_metric,
     overflow_reading,
 )

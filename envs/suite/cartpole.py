@@ -9,8 +9,7 @@ from dm_control.suite import cartpole
 
 from envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, make_env
 from envs.suite.rewards import tolerance
-from purerl.core.records import Array
-from purerl.physics import lookup
+from purerl import Array, lookup
 
 TASKS = ("balance", "swingup")
 READINGS = ("xmat",)

@@ -9,9 +9,7 @@ from dm_control.suite import cheetah
 
 from envs.suite.base import Moment, Start, SuiteEnv, load_model, make_env
 from envs.suite.rewards import tolerance
-from purerl.core.records import Array
-from purerl.physics import lookup
-from purerl.physics.interface import Physics
+from purerl import Array, Physics, lookup
 
 RUN_SPEED = 10.0  # [m/s]
 SETTLING = 200  # physics steps from the random pose to the start of the episode

@@ -16,9 +16,7 @@ from envs.suite.base import (
     random_joints,
     touching_pairs,
 )
-from purerl.core.records import Array
-from purerl.physics import lookup
-from purerl.physics.interface import Physics
+from purerl import Array, Physics, lookup
 
 SPIN = 15.0  # [rad/s], in the negative direction
 SPINNER_DAMPING = 0.03  # dm_control lowers the hinge's for this task [N m s/rad]

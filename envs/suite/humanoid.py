@@ -19,9 +19,7 @@ from envs.suite.base import (
     touching_pairs,
 )
 from envs.suite.rewards import tolerance
-from purerl.core.records import Array
-from purerl.physics import lookup
-from purerl.physics.interface import Physics
+from purerl import Array, Physics, lookup
 
 SPEEDS = {"stand": 0.0, "walk": 1.0, "run": 10.0}  # [m/s]
 STAND_HEIGHT = 1.4  # of the head [m]

@@ -9,8 +9,7 @@ from dm_control.suite import pendulum
 
 from envs.suite.base import Moment, Start, SuiteEnv, load_model, make_env
 from envs.suite.rewards import tolerance
-from purerl.core.records import Array
-from purerl.physics import lookup
+from purerl import Array, lookup
 
 READINGS = ("xmat",)
 UPRIGHT = float(np.cos(np.deg2rad(8)))  # cosine of the angle within which it is up

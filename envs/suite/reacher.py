@@ -13,8 +13,7 @@ from dm_control.suite import reacher
 
 from envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, make_env, random_joints
 from envs.suite.rewards import tolerance
-from purerl.core.records import Array
-from purerl.physics import lookup
+from purerl import Array, lookup
 
 TARGET_SIZES = {"easy": 0.05, "hard": 0.015}  # radius [m]
 READINGS = ("geom_xpos",)

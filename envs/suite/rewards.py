@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from purerl.core.records import Array
+from purerl import Array
 
 SIGMOIDS = ("gaussian", "hyperbolic", "linear", "long_tail", "quadratic")
 

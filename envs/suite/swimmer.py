@@ -9,8 +9,7 @@ from dm_control.suite import swimmer
 
 from envs.suite.base import Moment, Start, SuiteEnv, load_model, make_env, random_joints
 from envs.suite.rewards import tolerance
-from purerl.core.records import Array
-from purerl.physics import lookup
+from purerl import Array, lookup
 
 NEAR, FAR, NEAR_CHANCE = 0.3, 2.0, 0.2  # half-width of the target's square [m], and its chance
 READINGS = ("geom_xpos", "xmat", "sensordata")

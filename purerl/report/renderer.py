@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from purerl.core.errors import RunError
+from purerl.core.errors import RunError, UserError
 
 INSTALL = (
     "Install a software renderer with `apt-get install libosmesa6`, or, on a machine with an "
@@ -62,6 +62,19 @@ def open_gl(width: int, height: int) -> Any:
             f"OpenGL does not start by {backend} ({type(error).__name__}). {INSTALL}"
         ) from error
     return context
+
+
+def parse_size(size: str) -> tuple[int, int]:
+    """Returns (width, height) [pixels] of "640x480"."""
+    parts = size.lower().split("x")
+    if len(parts) != 2 or not all(part.isdigit() for part in parts):
+        raise UserError(f"size is {size!r}; give width x height in pixels, such as 640x480.")
+    width, height = map(int, parts)
+    if width % 2 or height % 2 or not 16 <= min(width, height) <= max(width, height) <= 4096:
+        raise UserError(
+            f"size is {size}; width and height must be even and from 16 to 4096 pixels."
+        )
+    return width, height
 
 
 # --- drawing ---

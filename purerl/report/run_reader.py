@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from purerl.core.errors import UserError, one_line, unknown_name
 from purerl.ppo.config import Config
 from purerl.runs.files import read_json, runs_in
+from purerl.runs.loaded_run import read_metrics
 from purerl.runs.loggers import MAX_SKIPPED_IN_A_ROW
 
 NOT_LEARNING = ("seed", "evaluation")  # settings that tell runs of one configuration apart
@@ -88,7 +89,7 @@ def read(path: Path) -> RunRecord:
             settings=flatten({"experiment": config["experiment"]} | learning),
             manifest=read_json(path / "manifest.json"),
             source=(path / "experiment.py").read_bytes(),
-            lines=_read_lines(path / "metrics.jsonl"),
+            lines=read_metrics(path / "metrics.jsonl"),
             planned=planned_updates(settings["ppo"]),
         )
     except (KeyError, TypeError, AttributeError) as error:

@@ -1,29 +1,112 @@
 """Command lines from dataclasses, by tyro, with one-line errors."""
 
 import contextlib
+import dataclasses
+import enum
 import io
 import re
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import tyro
 
-from purerl.core.errors import UserError
+from purerl.core.errors import SUCCESS, RunError, UserError
+from purerl.runs import experiment
+from purerl.runs.command_errors import tell
+from purerl.runs.experiment import Experiment, Source
+from purerl.runs.options import Options
 
 CONFIG = (tyro.conf.FlagCreatePairsOff,)
+# A flag takes a word, True or False, as every other option does.
+WORDS = (tyro.conf.FlagConversionOff,)
 
 
-def parse(kind: Any, arguments: Sequence[str], prog: str, default: Any = None) -> Any:
+def carry_out(
+    kind: Any, command: Callable[[Any], None], prog: str, arguments: Sequence[str] | None
+) -> int:
+    """Runs a command with its options; returns the exit code, an error being told in one line.
+
+    Args:
+      kind: the dataclass of its options.
+      command: called with them.
+      prog: the command's words, for the help page.
+      arguments: the command line; None: this process's.
+    """
+    try:
+        command(parse(kind, sys.argv[1:] if arguments is None else arguments, prog))
+    except (UserError, RunError) as error:
+        return tell(error)
+    return SUCCESS
+
+
+def from_command_line(
+    source: Source, arguments: Sequence[str], prog: str, config: Any = CONFIG
+) -> tuple[Experiment, Options]:
+    """Returns the experiment with its overrides, and the run's options.
+
+    Args:
+      source: the experiment.
+      arguments: the command line after the experiment's name.
+      prog: the command before `arguments`, for the help page and for errors.
+      config: tyro's markers.
+
+    Raises:
+      UserError: there is no such option, or a value is wrong.
+    """
+    values = experiment.settings(source.experiment)
+    kinds = {f.name: f.type for f in dataclasses.fields(Experiment)}
+    fields = [
+        (name, type(value) if dataclasses.is_dataclass(value) else kinds[name],
+         dataclasses.field(kw_only=True))
+        for name, value in values.items()
+    ]  # fmt: skip
+    # A class made for this experiment: its settings have the types of their values, which is all
+    # that the command line needs to know, so an environment's options need no registration.
+    both = dataclasses.make_dataclass("Settings", fields, bases=(Options,), frozen=True)
+    both.__doc__ = experiment.summary(source.path) or f"Trains {source.name}."
+    parsed = parse(both, arguments, prog, both(**values), config)
+    overrides = {name: getattr(parsed, name) for name in values}
+    options = {f.name: getattr(parsed, f.name) for f in dataclasses.fields(Options)}
+    return dataclasses.replace(source.experiment, **overrides), Options(**options)
+
+
+def from_settings(
+    source: Source, settings: Mapping[str, Any], options: Mapping[str, Any]
+) -> tuple[Experiment, Options]:
+    """Returns the same as `from_command_line`, from Python values, checked in the same way.
+
+    Args:
+      source: the experiment.
+      settings: "ppo.num_envs" -> value.
+      options: "num_seeds" -> value.
+    """
+    words = [word for pair in (dict(settings) | dict(options)).items() for word in _words(*pair)]
+    return from_command_line(source, words, f"python -m purerl.run {source.name}", WORDS)
+
+
+def _words(name: str, value: Any) -> list[str]:
+    """Returns an option of the command line with its value."""
+    if isinstance(value, Mapping):
+        value = [part for pair in value.items() for part in pair]
+    parts = value if isinstance(value, list | tuple) else [value]
+    texts = [part.name if isinstance(part, enum.Enum) else str(part) for part in parts]
+    return [f"--{name.replace('_', '-')}", *texts]
+
+
+def parse(
+    kind: Any, arguments: Sequence[str], prog: str, default: Any = None, config: Any = CONFIG
+) -> Any:
     """Parses a command line into the dataclass `kind`; `--help` prints a page and exits.
 
     Raises:
-      UserError: an option that there is not, with the nearest there is, or a value that is wrong.
+      UserError: there is no such option (the message has the nearest one), or a value is wrong.
     """
     extra = {} if default is None else {"default": default}
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(kind, args=list(arguments), prog=prog, config=CONFIG, **extra)
+            return tyro.cli(kind, args=list(arguments), prog=prog, config=config, **extra)
     except SystemExit as error:
         if not error.code:
             raise

@@ -9,6 +9,7 @@ import dataclasses
 import enum
 import importlib
 import importlib.util
+import itertools
 import re
 import sys
 import traceback
@@ -59,6 +60,8 @@ class Source(NamedTuple):
     path: Path
 
 
+FOUND: list[Source] = []  # by `find`: so that `train` knows an experiment's file by its object
+
 # --- finding ---
 
 
@@ -69,13 +72,23 @@ def folders() -> list[Path]:
 
 
 def available() -> dict[str, Path]:
-    """Returns the named experiments, name -> file; the first folder wins.
+    """Returns the named experiments, name -> file; of two of one name the first folder's.
 
-    Scripts stand beside them: an experiment is a file that gives its `experiment` a value.
+    They come in the order in which the folder's `__init__.py` mentions them, the others after.
     """
-    files = [file for folder in reversed(folders()) for file in sorted(folder.glob("*.py"))]
-    gives = re.compile(r"^experiment(: *Experiment)? = ", re.MULTILINE)
-    return {file.stem: file for file in files if gives.search(file.read_text())}
+    found: dict[str, Path] = {}
+    for folder in folders():
+        about = folder / "__init__.py"
+        order = re.findall(r"\w+", about.read_text()) if about.exists() else []
+        files = [file for file in sorted(folder.glob("*.py")) if defines_experiment(file)]
+        files.sort(key=lambda file: order.index(file.stem) if file.stem in order else len(order))
+        found = found | {file.stem: file for file in files if file.stem not in found}
+    return found
+
+
+def defines_experiment(file: Path) -> bool:
+    """Tells whether a file gives its `experiment` a value; other scripts may stand beside it."""
+    return bool(re.search(r"^experiment(: *Experiment)? = ", file.read_text(), re.MULTILINE))
 
 
 def summary(path: Path) -> str:
@@ -87,8 +100,18 @@ def summary(path: Path) -> str:
     return text.splitlines()[0] if text else ""
 
 
-def find(name: str) -> Source:
-    """Loads an experiment by name in experiments/, path of a Python file, or dotted module."""
+def find(name: str) -> Experiment:
+    """Returns an experiment by name in experiments/, path of a Python file, or dotted module.
+
+    >>> find("cartpole_swingup").ppo.num_envs
+    64
+    """
+    FOUND.append(find_source(name))
+    return FOUND[-1].experiment
+
+
+def find_source(name: str) -> Source:
+    """Loads an experiment by name, path or module; see `find`."""
     named = available()
     if name.endswith(".py") or "/" in name:
         path = Path(name)
@@ -113,12 +136,17 @@ def load(path: Path, name: str = "", copy_of: Path | None = None) -> Source:
         the experiment reads stands beside it.
     """
     path = path.resolve()
-    module_name = f"purerl_experiment_{path.stem}"
-    # A file of a package, imported under its own name, so that its source counts as the package's.
-    if (path.parent / "__init__.py").exists() and str(path.parent.parent) in sys.path:
-        module_name = f"{path.parent.name}.{path.stem}"
     place = copy_of if copy_of is not None and copy_of.is_file() else path
-    return _checked(_execute(module_name, path, place), name or path.stem, path)
+    return _checked(_execute(_module_name(path), path, place), name or path.stem, path)
+
+
+def _module_name(path: Path) -> str:
+    """Returns a file's name as a module: in a package its own, so that its source counts there."""
+    in_package = lambda folder: (folder / "__init__.py").exists()  # noqa: E731
+    package = list(itertools.takewhile(in_package, path.parents))
+    if package and str(package[-1].parent) in sys.path:
+        return ".".join(path.with_suffix("").relative_to(package[-1].parent).parts)
+    return f"purerl_experiment_{path.stem}"
 
 
 def _execute(module_name: str, path: Path, place: Path) -> ModuleType:
@@ -146,12 +174,15 @@ def _mistakes(file: str, place: Path) -> Iterator[None]:
         frames = traceback.extract_tb(error.__traceback__)
         lines = [frame.lineno for frame in frames if frame.filename == file]
         where = f", line {lines[-1]}" if lines else ""
-        raise UserError(f"{file}{where}: {one_line(error)}{_hint(place, error)}") from error
+        raise UserError(f"{file}{where}: {one_line(error)}{_hint(file, place, error)}") from error
 
 
-def _hint(file: Path, error: Exception) -> str:
-    """Returns what to do about a module that stands beside the file that imports it."""
-    beside = file.parent
+def _hint(file: str, original: Path, error: Exception) -> str:
+    """Returns what to do about a module that a file imports and that is not found."""
+    beside = original.parent
+    if isinstance(error, ModuleNotFoundError) and error.name == "purerl":
+        of_run = (Path(file).parent / "config.json").exists()
+        return " The run was made by an older purerl: train it anew." if of_run else ""
     if isinstance(error, ModuleNotFoundError) and error.name:
         place = beside / error.name.partition(".")[0]
         if place.is_dir() or place.with_suffix(".py").exists():

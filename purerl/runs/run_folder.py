@@ -168,11 +168,7 @@ def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> Rest
       engine: instead of the run's own, where that one is not at hand.
     """
     folder = Path(folder)
-    if not (folder / "config.json").is_file():
-        inside = ", ".join(map(str, runs_in(folder)))
-        runs = f" Runs in it: {inside}." if inside else ""
-        what = "no run: it has no config.json" if folder.is_dir() else "no folder"
-        raise UserError(f"{folder} is {what}.{runs}")
+    check_is_run(folder)
     settings = read_json(folder / "config.json")
     begun = read_json(folder / "manifest.json")
     original = Path(begun["experiment_file"]) if "experiment_file" in begun else None
@@ -188,6 +184,15 @@ def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> Rest
     abstract = abstract.replace(env=None, episode=None, optimizer=None)
     saved = _choose(folder / "checkpoints", update, abstract, say)
     return RestoredRun(chosen, setup, saved, settings)
+
+
+def check_is_run(folder: Path) -> None:
+    """Raises UserError unless a folder holds a run; the message lists the runs inside of it."""
+    if not (folder / "config.json").is_file():
+        inside = ", ".join(map(str, runs_in(folder)))
+        runs = f" Runs in it: {inside}." if inside else ""
+        what = "no run: it has no config.json" if folder.is_dir() else "no folder"
+        raise UserError(f"{folder} is {what}.{runs}")
 
 
 def changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[str]:

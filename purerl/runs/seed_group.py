@@ -24,7 +24,7 @@ from purerl.runs.video_process import RunVideo
 from purerl.runs.writer import RunWriter
 
 if TYPE_CHECKING:
-    from purerl.run import Options
+    from purerl.runs.options import Options
 
 
 def train_together(

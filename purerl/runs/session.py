@@ -38,7 +38,9 @@ from purerl.runs.files import read_json
 from purerl.runs.seed_group import needed_loggers, train_together
 
 if TYPE_CHECKING:
-    from purerl.run import Options
+    from purerl.runs.options import Options
+
+MANY = 9  # edited files, which a refusal to resume then counts and does not list
 
 
 def execute(
@@ -187,10 +189,15 @@ def begin_or_go_on(
         pin = "device.threads"  # a CPU's bits depend on the size of XLA's thread pool
         threads = [line.split()[1] for line in found if line.startswith(pin)]
         found += [f"(NPROC={number} brings {pin} back)" for number in threads]
+        edited = [line for line in found if line.startswith("source.")]
+        if len(edited) > MANY:
+            found = [line for line in found if line not in edited]
+            found.append(f"source: {len(edited)} files, as of another version of purerl")
         raise UserError(
             f"The run {folder} was begun under other conditions, so it would not go on exactly:\n  "
             + "\n  ".join(found)
-            + "\nGive the command it was begun with, or --allow-changes to go on all the same."
+            + "\nGive the command it was begun with, train anew under another --name, or go on all "
+            "the same with --allow-changes."
         )
     if found:
         checkpoint.check_fits(folder / "checkpoints", abstract)

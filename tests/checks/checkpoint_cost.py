@@ -19,9 +19,8 @@ import jax
 from purerl.devices import programs
 from purerl.devices.compilation import set_up_jax
 from purerl.ppo import algorithm
-from purerl.run import from_command_line
 from purerl.runs import build_experiment, checkpoint, console, experiment, state_arrays
-from purerl.runs.command_line import parse
+from purerl.runs.command_line import from_command_line
 
 TIMES = 5
 
@@ -34,8 +33,8 @@ def main() -> None:
     )
     parser.add_argument("words", nargs="+", help="-- EXPERIMENT [--option value ...]")
     words = parser.parse_args().words
-    source = experiment.find(words[0])
-    chosen, _ = from_command_line(parse, source, words[1:], "tests.checks.checkpoint_cost")
+    source = experiment.find_source(words[0])
+    chosen, _ = from_command_line(source, words[1:], "tests.checks.checkpoint_cost")
     set_up_jax(True)
     setup = build_experiment.build(chosen)
     state = jax.jit(functools.partial(algorithm.init, *setup[:3]))(jax.random.key(1))

@@ -105,7 +105,7 @@ def test_both_trainers_learn_with_equal_sizes():
 def test_braxs_environment_keeps_to_the_protocol_and_steps_as_braxs():
     """Its states through our record and back are the states that brax steps through itself."""
     pytest.importorskip("brax", reason="needs the extra peers")
-    from envs import brax_env
+    from experiments.peers import brax_env
 
     env = brax_env.build(brax_env.Options(backend="positional"))  # the quickest to compile
     check_env(env)
@@ -137,7 +137,7 @@ def test_braxs_settings_make_the_same_update(body):
 @pytest.mark.parametrize("body", ["ant", "humanoid"])
 def test_braxs_body_moves_on_our_physics_as_on_braxs(body):
     pytest.importorskip("brax", reason="needs the extra peers")
-    from envs import brax_env
+    from experiments.peers import brax_env
 
     ours, theirs = (
         brax_env.build(brax_env.Options(body, physics), "jax") for physics in ("purerl", "mjx")
@@ -184,7 +184,7 @@ def test_braxs_network_is_braxs():
     pytest.importorskip("brax", reason="needs the extra peers")
     from brax.training.agents.ppo import networks as brax_networks
 
-    from experiments import brax_network
+    from experiments.peers import brax_network
 
     theirs = brax_networks.make_ppo_networks(
         27, 8, policy_hidden_layer_sizes=(32,) * 4, value_hidden_layer_sizes=(256,) * 5

@@ -20,13 +20,13 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from purerl import exact, run
+from purerl import exact
 from purerl.core.records import PyTree
 from purerl.ppo import algorithm
 from purerl.runs import build_experiment, command_line, state_arrays
 from purerl.runs.build_experiment import Setup
 from purerl.runs.command_errors import leave
-from purerl.runs.experiment import find
+from purerl.runs.experiment import find_source
 
 ROWS = 12  # shown
 
@@ -45,9 +45,7 @@ def main(arguments: list[str]) -> int:
     precision = os.environ.get("JAX_DEFAULT_MATMUL_PRECISION", "highest")
     jax.config.update("jax_default_matmul_precision", precision)
     prog = f"python -m tests.checks.platforms {options.experiment}"
-    experiment, _ = run.from_command_line(
-        command_line.parse, find(options.experiment), overrides, prog
-    )
+    experiment, _ = command_line.from_command_line(find_source(options.experiment), overrides, prog)
     setup = build_experiment.build(experiment)
     if options.write:
         np.savez(options.write, **state_arrays.flatten(make(setup)))

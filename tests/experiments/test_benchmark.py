@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import benchmark, scaling, start_up
+from experiments.benchmarks import benchmark, scaling, start_up
 from purerl.core.errors import UserError
 from purerl.runs.experiment import find
 
@@ -19,7 +19,7 @@ from purerl.runs.experiment import find
 @pytest.fixture(scope="module")
 def small():
     """cartpole_swingup of 4 environments and 2 steps: physics and update, compiled."""
-    chosen = find("cartpole_swingup").experiment
+    chosen = find("cartpole_swingup")
     config = dataclasses.replace(chosen.ppo, num_envs=4, rollout_length=2, num_minibatches=1)
     return benchmark.make_bench(
         dataclasses.replace(chosen, ppo=config), ("physics alone", "update")
@@ -110,7 +110,7 @@ def test_a_run_that_ends_before_its_update_is_an_error(tmp_path):
 
 
 def test_scaling_changes_one_axis_and_keeps_minibatches(monkeypatch):
-    config = find("ant_run").experiment.ppo
+    config = find("ant_run").ppo
 
     def sizes(axis, value):
         words = scaling.overrides(axis, value, config, 1024)
@@ -155,7 +155,7 @@ def test_a_point_reads_the_benchmark_it_started(monkeypatch):
 
     ended = 0
     monkeypatch.setattr(scaling.subprocess, "run", run)
-    sweep = scaling.Sweep("ant_run", ["--seed", "3"], find("ant_run").experiment.ppo, 1024)
+    sweep = scaling.Sweep("ant_run", ["--seed", "3"], find("ant_run").ppo, 1024)
     row = scaling.point(sweep, "envs", 64)
     assert (row["steps_per_s"], row["physics_steps_per_s"], row["share"]) == (150, 200, 0.75)
     assert (row["state_mb"], row["update_mb"], row["process_mb"]) == (2.0, 5.0, 900)

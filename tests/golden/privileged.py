@@ -5,11 +5,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 
 from envs import cartpole_swingup
-from purerl.core.env import State
-from purerl.core.records import Array
-from purerl.ppo import networks
-from purerl.ppo.config import Config, Evaluation
-from purerl.runs.experiment import Experiment
+from purerl import Array, Config, Evaluation, Experiment, State, networks
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,7 @@
 """A cart-pole and a network with memory."""
 
 from envs import cartpole_swingup
-from purerl.ppo import networks
-from purerl.ppo.config import Config, Evaluation
-from purerl.runs.experiment import Experiment
+from purerl import Config, Evaluation, Experiment, networks
 
 experiment = Experiment(
     build_env=cartpole_swingup.build,

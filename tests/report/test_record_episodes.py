@@ -1,4 +1,4 @@
-"""`python -m experiments.record_episodes RUN`: its arrays are the run's policy, step by step."""
+"""`python -m purerl.record RUN`: its arrays are the run's policy, step by step."""
 
 import json
 from pathlib import Path
@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import record_episodes
-from purerl import evaluate, run
-from purerl.core.errors import UserError
+from purerl import evaluate, record, run
+from purerl.core.errors import USAGE
 from purerl.ppo import running_moments
 from purerl.ppo.networks import GaussianHead
+from purerl.report import episode_arrays
 from purerl.runs import run_folder
 
 TRAIN = """
@@ -45,7 +45,7 @@ def train_and_record(place: Path, build: str, network: str) -> Recorded:
     assert run.main([str(file), "--runs", str(place / "runs")]) == 0
     folder = place / "runs" / "mine" / "seed1"
     words = ["--episodes", "3", "--seed", "5", "--out", str(out)]
-    assert record_episodes.main([str(folder), *words]) == 0
+    assert record.main([str(folder), *words]) == 0
     return Recorded(
         folder, dict(np.load(out)), run_folder.restore(folder, "latest", print).saved.state
     )
@@ -121,7 +121,7 @@ def test_a_module_that_is_applied_twice_is_noted_twice():
 
     module, x = Twice(), jnp.ones(3)
     params, noted = module.init(jax.random.key(0), x), {}
-    with nn.intercept_methods(record_episodes.note_modules(noted)):
+    with nn.intercept_methods(episode_arrays.note_modules(noted)):
         first, second = module.apply(params, x)
     head = "GaussianHead_0"
     np.testing.assert_array_equal(noted[f"{head}.loc"], first.loc)
@@ -129,6 +129,15 @@ def test_a_module_that_is_applied_twice_is_noted_twice():
     np.testing.assert_array_equal(noted[f"{head}/loc_again"], second.loc)
 
 
-def test_a_mistake_is_one_line(mlp):
-    with pytest.raises(UserError, match="episodes is 0; it must be at least 1"):
-        record_episodes.main([str(mlp.folder), "--episodes", "0"])
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--episodes", "0"], "episodes is 0; it must be at least 1"),
+        (["--out", "/nowhere/x.npz"], "/nowhere/x.npz cannot be written"),
+        (["--checkpoint", "77"], "There is no checkpoint '77'"),
+    ],
+)
+def test_a_mistake_is_one_line(mlp, capsys, words, message):
+    assert record.main([str(mlp.folder), *words]) == USAGE
+    said = capsys.readouterr().err
+    assert message in said and len(said.splitlines()) == 1

@@ -26,7 +26,7 @@ def test_an_experiment_is_found_by_name_path_and_module(place):
         ("experiments/hopper.py", "hopper"),
         ("tests.runs.toy_experiment", "toy_experiment"),
     ]:
-        source = experiment.find(name)
+        source = experiment.find_source(name)
         assert source.name == expected and source.experiment.env.steps == 4
     (place / "experiments" / "plot.py").write_text('"""A script."""\n')
     found = experiment.available()
@@ -36,7 +36,7 @@ def test_an_experiment_is_found_by_name_path_and_module(place):
 @pytest.mark.parametrize("name", ["hoper", "experiments/none.py", "tests.none_such", "no_such.x"])
 def test_an_unknown_experiment_is_one_line(place, name):
     with pytest.raises(UserError) as error:
-        experiment.find(name)
+        experiment.find_source(name)
     assert "\n" not in str(error.value)
     if name == "hoper":
         assert "Did you mean 'hopper'?" in str(error.value)
@@ -114,7 +114,7 @@ def test_a_mistake_in_a_module_names_its_line(tmp_path, monkeypatch):
         if "imports" in message:
             (tmp_path / "mods" / "mod0.py").write_text("")
         with pytest.raises(UserError, match=message):
-            experiment.find(f"mods.mod{i}")
+            experiment.find_source(f"mods.mod{i}")
 
 
 def test_missing_and_unknown_settings_are_named():

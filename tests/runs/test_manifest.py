@@ -150,7 +150,7 @@ def test_a_run_on_c_imports_no_other_engine():
     lines = [
         "import sys",
         "from purerl.runs import build_experiment, experiment, manifest",
-        "chosen = experiment.find('ant_run').experiment",
+        "chosen = experiment.find('ant_run')",
         "setup = build_experiment.build(chosen)",
         "manifest.collect(setup.engine, [chosen.build_env, chosen.build_network])",
         "assert setup.engine == 'c'",

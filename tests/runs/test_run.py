@@ -1,5 +1,6 @@
 """The run command: the same bits however it is interrupted, and one line for every mistake."""
 
+import contextlib
 import dataclasses
 import errno
 import importlib.util
@@ -31,6 +32,7 @@ from purerl.runs import (
     console,
     run_folder,
     state_arrays,
+    training,
     writer,
 )
 from purerl.runs.experiment import find
@@ -95,8 +97,9 @@ def stop_after(monkeypatch):
     """Makes the next run stop by itself after some questions."""
 
     def use(questions: int) -> None:
-        monkeypatch.setattr(run, "stop_signals", lambda: run.contextmanager(one)(questions))
+        monkeypatch.setattr(training, "stop_signals", lambda _: one(questions))
 
+    @contextlib.contextmanager
     def one(questions):
         yield Stopper(questions)
 
@@ -209,7 +212,7 @@ def test_a_run_killed_in_its_first_save_begins_as_it_did(whole, tmp_path, stop_a
 
 @pytest.mark.parametrize("num_shards", [1, 2])
 def test_a_beginning_has_the_same_bits_however_it_is_compiled(num_shards):
-    chosen = find("cartpole_swingup").experiment
+    chosen = find("cartpole_swingup")
     chosen = dataclasses.replace(chosen, engine="c", evaluation=Evaluation(number=0))
     setup = build_experiment.build(chosen)
     digests = set()
@@ -560,7 +563,7 @@ def test_the_second_signal_ends_at_once(monkeypatch, capsys):
     ended = []
     before = signal.getsignal(signal.SIGINT)  # not Python's own in a background job
     monkeypatch.setattr(os, "_exit", ended.append)
-    with run.stop_signals() as stop:
+    with training.stop_signals(os._exit) as stop:
         assert not stop()
         os.kill(os.getpid(), signal.SIGTERM)
         assert stop() and not ended

@@ -10,7 +10,7 @@ import pytest
 from purerl import run
 from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE, RunError, UserError
 from purerl.devices import programs
-from purerl.runs import checkpoint, checkpoint_folder, loop, session, state_arrays, writer
+from purerl.runs import checkpoint, checkpoint_folder, loop, session, state_arrays, training, writer
 from tests.runs.test_run import ROOT, TOY, Stopper, digest, folder, lines, start
 
 CARTPOLE = ["--ppo.num-envs", "4", "--ppo.rollout-length", "8", "--ppo.num-steps", "128"]
@@ -34,10 +34,10 @@ def stop_after(monkeypatch):
 
     def use(questions: int) -> None:
         @contextlib.contextmanager
-        def signals():
+        def signals(_):
             yield Stopper(questions)
 
-        monkeypatch.setattr(run, "stop_signals", signals)
+        monkeypatch.setattr(training, "stop_signals", signals)
 
     return use
 

@@ -1,7 +1,7 @@
 """How cost grows: steps/s and memory over environments, rollout length, width, cores and seeds.
 
-    python -m experiments.scaling --csv docs/scaling.csv
-    python -m experiments.scaling --engine jax --minibatch 4096 --ppo.num-envs 4096   # on a GPU
+    python -m experiments.benchmarks.scaling --csv docs/scaling.csv
+    python -m experiments.benchmarks.scaling --engine jax --minibatch 4096   # on a GPU
 
 One axis varies, the rest stays as the experiment and its overrides have it; a minibatch holds at
 most `--minibatch` samples, so that the learner's work for a sample is the same everywhere. Each
@@ -25,13 +25,14 @@ from typing import Any, NamedTuple
 
 import jax
 
-from experiments.benchmark import compile_part, measure
-from purerl import exact, run
+from experiments.benchmarks.benchmark import compile_part, measure
+from purerl import exact
 from purerl.core.errors import UserError
 from purerl.ppo import algorithm
-from purerl.runs import build_experiment, command_line
+from purerl.runs import build_experiment
 from purerl.runs.command_errors import leave
-from purerl.runs.experiment import Experiment, find
+from purerl.runs.command_line import from_command_line
+from purerl.runs.experiment import Experiment, find_source
 from purerl.runs.files import output_file
 
 HERE = sorted(os.sched_getaffinity(0))  # cores that this process may use
@@ -76,7 +77,13 @@ def point(sweep: Sweep, axis: str, value: int) -> dict[str, Any]:
     """Measures one point in a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "found.json"
-        command = [sys.executable, "-m", "experiments.benchmark", sweep.name, *sweep.words]
+        command = [
+            sys.executable,
+            "-m",
+            "experiments.benchmarks.benchmark",
+            sweep.name,
+            *sweep.words,
+        ]
         command += ["--rounds", "2", "--least-s", "0.5", "--json", str(file)]
         command += ["--parts", "physics alone", "update"]
         command += overrides(axis, value, sweep.config, sweep.minibatch)
@@ -153,9 +160,9 @@ def main(arguments: list[str]) -> int:
     options, words = parser.parse_known_args(arguments)
     if options.minibatch < 1:
         parser.error(f"--minibatch is {options.minibatch}; it must be at least 1.")
-    seeds = find(options.seeds_experiment).experiment
-    prog = "python -m experiments.scaling"
-    experiment, _ = run.from_command_line(command_line.parse, find(options.experiment), words, prog)
+    seeds = find_source(options.seeds_experiment).experiment
+    prog = "python -m experiments.benchmarks.scaling"
+    experiment, _ = from_command_line(find_source(options.experiment), words, prog)
     sweep = Sweep(options.experiment, words, experiment.ppo, options.minibatch)
     exact.set_xla_flags()  # for seeds, in this process
     rows = []

@@ -1,10 +1,10 @@
 """brax's PPO beside ours: the whole training from cold, and the returns of several seeds.
 
-    python -m experiments.brax_training brax ant --seeds 0 1 2 3 4 --json brax_ant.json
-    python -m experiments.brax_training purerl ant --seeds 0 1 2 3 4 --json purerl_ant.json
-    python -m experiments.brax_training table brax_ant.json purerl_ant.json
+    python -m experiments.peers.brax_training brax ant --seeds 0 1 2 3 4 --json brax_ant.json
+    python -m experiments.peers.brax_training purerl ant --seeds 0 1 2 3 4 --json purerl_ant.json
+    python -m experiments.peers.brax_training table brax_ant.json purerl_ant.json
 
-Settings are those of `experiments/brax_peer.py`. One process trains with one trainer, so that
+Settings are those of `experiments/peers/brax_peer.py`. One process trains with one trainer, so that
 neither finds the machine warmed by the other, and brax keeps XLA's own choice of kernels. With
 `purerl on brax's physics` and `purerl` it is the first or the third line of that table.
 
@@ -28,11 +28,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from experiments.brax_peer import BODIES, Published, our_experiment, resize, train_brax
+from experiments.peers.brax_peer import BODIES, Published, our_experiment, resize, train_brax
 from purerl import exact
 from purerl.core.errors import UserError
-from purerl.devices import compilation
-from purerl.devices.programs import Programs
+from purerl.devices.programs import Programs, compile_programs
+from purerl.devices.shards import Shards
 from purerl.ppo.config import Evaluation
 from purerl.report import bootstrap
 from purerl.runs import build_experiment
@@ -102,7 +102,7 @@ def our_programs(task: Task, physics: str) -> Programs:
     chosen = our_experiment(task.body, physics, task.sizes, task.steps)
     config, env, network, _ = build_experiment.build(chosen)
     evaluation = Evaluation(num_episodes=NUM_EPISODES)
-    return compilation.compile_programs(config, env, network, evaluation, fresh=True)
+    return compile_programs(config, env, network, evaluation, True, Shards())
 
 
 def run_ours(task: Task, trainer: str, seed: int) -> Run:

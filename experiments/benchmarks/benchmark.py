@@ -1,8 +1,8 @@
 """Where time and memory go: physics, rollout, learner, update, evaluation of an experiment.
 
-    python -m experiments.benchmark ant_run
-    python -m experiments.benchmark ant_run --engine jax --ppo.num-envs 4096 --json out.json
-    python -m experiments.benchmark ant_run --start-up    # from the command to the first update
+    python -m experiments.benchmarks.benchmark ant_run
+    python -m experiments.benchmarks.benchmark ant_run --engine jax --json out.json
+    python -m experiments.benchmarks.benchmark ant_run --start-up    # time to the first update
 
 Each part is compiled by itself and timed in rounds, part after part, so that a busy moment of the
 machine falls on all of them; the median of the rounds counts. Rates are control steps per second.
@@ -29,8 +29,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from experiments import start_up
-from purerl import exact, run
+from experiments.benchmarks import start_up
+from purerl import exact
 from purerl.core.records import Array, Network, PyTree, TrainState
 from purerl.physics.lookup import scale_action
 from purerl.ppo import algorithm, learner
@@ -39,7 +39,7 @@ from purerl.ppo.rollout import rollout
 from purerl.runs import build_experiment, command_line
 from purerl.runs.command_errors import leave
 from purerl.runs.console import size
-from purerl.runs.experiment import Experiment, find
+from purerl.runs.experiment import Experiment, find_source
 from purerl.runs.files import output_file
 
 PARTS = ("physics alone", "rollout", "learner", "update", "evaluation")
@@ -238,10 +238,8 @@ def main(arguments: list[str]) -> int:
     if options.start_up:
         return start_up.main([options.experiment, *overrides])
     exact.set_xla_flags()  # as a run does, before JAX starts
-    prog = f"python -m experiments.benchmark {options.experiment}"
-    experiment, _ = run.from_command_line(
-        command_line.parse, find(options.experiment), overrides, prog
-    )
+    prog = f"python -m experiments.benchmarks.benchmark {options.experiment}"
+    experiment, _ = command_line.from_command_line(find_source(options.experiment), overrides, prog)
     bench = make_bench(experiment, options.parts)
     timings = measure(bench.parts, options.rounds, options.least_s)
     held = memory(bench)

@@ -1,7 +1,7 @@
 """Every environment on every engine: does it keep the contract, and how fast is it?
 
-    python -m experiments.every_environment
-    python -m experiments.every_environment --engines c --num-envs 64 --only rodent_gaps walker-walk
+    python -m experiments.benchmarks.every_environment
+    python -m experiments.benchmarks.every_environment --engines c --only rodent_gaps walker-walk
 
 A row has control steps/s of the bare engine under random controls, of the rollout (policy, reward,
 observations and resets included), and the rollout's share; both timed in turns in one process.
@@ -15,7 +15,7 @@ import jax
 
 from envs.suite.tasks import TASKS
 from envs.suite.tasks import Options as SuiteOptions
-from experiments.benchmark import bare_physics, compile_part, measure
+from experiments.benchmarks.benchmark import bare_physics, compile_part, measure
 from purerl.core.errors import UserError, one_line
 from purerl.ppo import algorithm
 from purerl.ppo.rollout import rollout
@@ -30,9 +30,9 @@ ROW = "| {:24} | {:6} | {:8} | {:>13} | {:>9} | {:>5} |"
 
 def all_experiments() -> dict[str, Experiment]:
     """Returns name -> experiment: ours, and each task of the suite."""
-    suite = find("suite").experiment
+    suite = find("suite")
     of_suite = {name: dataclasses.replace(suite, env=SuiteOptions(task=name)) for name in TASKS}
-    return {name: find(name).experiment for name in OURS} | of_suite
+    return {name: find(name) for name in OURS} | of_suite
 
 
 def sized(experiment: Experiment, engine: str, num_envs: int, length: int) -> Experiment:
@@ -64,7 +64,7 @@ def main() -> int:
     """Prints the table; exit code 1 if an environment breaks the contract."""
     plain = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
-        "experiments.every_environment", description=__doc__, formatter_class=plain
+        "experiments.benchmarks.every_environment", description=__doc__, formatter_class=plain
     )
     experiments = all_experiments()
     parser.add_argument("--engines", nargs="+", default=["c", "jax"])

@@ -1,11 +1,12 @@
 """brax's PPO beside ours, on brax's own bodies with brax's published settings: steps per second.
 
     python -m pip install -c constraints.txt -e '.[peers]'
-    python -m experiments.brax_peer ant humanoid --json rates.json
-    python -m experiments.brax_peer ant --trainers brax    # with XLA's own choice of kernels
+    python -m experiments.peers.brax_peer ant humanoid --json rates.json
+    python -m experiments.peers.brax_peer ant --trainers brax    # with XLA's own choice of kernels
 
-Same observation, reward, end and start (brax's code, `envs/brax_env.py`), networks, environments,
-samples, minibatches and epochs; no evaluation and no checkpoint. Three lines of a table:
+Same observation, reward, end and start (brax's code, `experiments/peers/brax_env.py`), networks,
+environments, samples, minibatches and epochs; no evaluation and no checkpoint. Three lines of a
+table:
 
     brax                      its own figure, "training/sps", between calls of its progress function
     purerl on brax's physics  MJX as brax calls it, the whole `mjx.Data` carried from step to step
@@ -16,7 +17,7 @@ observation, reward or network; brax's is that of the second line. What differs 
 each trainer does besides: ours draws a fresh start for each episode, takes MJX's matrix products in
 whole float32, and leaves no lambda out of the advantage.
 
-Whole training and its returns: `experiments/brax_training.py`.
+Whole training and its returns: `experiments/peers/brax_training.py`.
 """
 
 import argparse
@@ -32,13 +33,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from envs import brax_env
-from experiments import brax_network
-from experiments.benchmark import Part, measure
-from experiments.peers import Ours
+from experiments.benchmarks.benchmark import Part, measure
+from experiments.peers import brax_env, brax_network
+from experiments.peers.sb3 import Ours
 from purerl import exact
 from purerl.core.records import Array, PyTree
 from purerl.devices import compilation
+from purerl.devices.programs import abstract_state, compile_programs
+from purerl.devices.shards import Shards
 from purerl.ppo.config import Config, Evaluation
 from purerl.runs import build_experiment
 from purerl.runs.command_errors import leave
@@ -136,10 +138,11 @@ def our_parts(chosen: Experiment) -> list[Part]:
     """Compiles the physics alone and our training, side by side, and makes the first update."""
     config, env, network, _ = build_experiment.build(chosen)
     key = jax.random.key(chosen.seed)
-    abstract = compilation.abstract_state(config, env, network).env.physics
+    abstract = abstract_state(config, env, network).env.physics
     bare: Callable = partial(physics_alone, env, config.rollout_length)
     compiling = compilation.start("physics alone", jax.jit(bare).trace(abstract, key), {})
-    programs = compilation.compile_programs(config, env, network, Evaluation(number=0), fresh=True)
+    never = Evaluation(number=0)
+    programs = compile_programs(config, env, network, never, True, Shards())
     alone, state = compiling.result(), programs.init(key)
     # A copy: an update takes its state over.
     start = jax.tree.map(jnp.copy, state.env.physics)

@@ -1,7 +1,7 @@
-"""Gymnasium's Ant-v5, to compare with other trainers (`python -m experiments.peers`).
+"""Gymnasium's Ant-v5, to compare with other trainers (`python -m experiments.peers.sb3`).
 
 python -m pip install -c constraints.txt -e '.[peers]'
-python -m purerl.run gymnasium_ant
+python -m purerl.run experiments/peers/gymnasium_ant.py
 """
 
 from envs import gymnasium_ant

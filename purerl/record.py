@@ -1,0 +1,72 @@
+"""Records episodes as arrays in one file: `python -m purerl.record RUN [--out episodes.npz]`.
+
+The episodes begin as those of `python -m purerl.evaluate RUN --engine E --seed S` with as many of
+them do: deterministic, in fresh environments. Another program computes them, so the last bits
+differ, and a body with contacts goes its own way in the end: count returns from `reward` here.
+Every array is [N, T, ...] but for `length`, N episodes of at most T policy steps:
+
+    length [N]          policy steps of the episode; what comes after them is no part of it
+    observation         before the step, as the environment gives it (the network gets it
+                        normalized), [O] or a dict's parts
+    physics/qpos ...    the simulation's state before the step
+    task/...            what the environment remembers besides: the corridor's gaps, a target
+    metrics/...         the environment's, before the step
+    action [A]          in [-1, 1]; `reward` of the step that it began; `value` of the observation
+    memory/...          of a recurrent network, before the step
+    network/MODULE      what each module of a Flax network returned: `network/policy/Dense_0` is a
+                        layer before its activation, `network/policy` the last one after it; a
+                        part of what it returned is named after a dot, `network/head.scale`
+
+MuJoCo's model, to compute from `qpos` where limbs are, is `purerl.load(RUN).env.physics.model`.
+What a module does inside Flax's own loops (`nn.scan`, `nn.vmap`) cannot be noted.
+"""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from purerl.core.errors import UserError
+from purerl.runs.command_errors import leave
+from purerl.runs.command_line import carry_out
+from purerl.runs.options import PlayOptions
+
+
+@dataclass(frozen=True)
+class Options(PlayOptions):  # noqa: D101 (--help prints the page above)
+    __doc__ = __doc__
+
+    out: Path = Path("episodes.npz")
+    """File to write."""
+    episodes: int = 8
+    """Whole episodes, N."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    return carry_out(Options, command, "python -m purerl.record", arguments)
+
+
+def command(options: Options) -> None:
+    """Writes the file and tells what is in it."""
+    import numpy as np
+
+    from purerl.report.episode_arrays import record
+    from purerl.runs.loaded_run import load
+
+    if options.episodes < 1:
+        raise UserError(f"episodes is {options.episodes}; it must be at least 1.")
+    place = options.out.absolute().parent
+    if not os.access(place, os.W_OK):
+        raise UserError(f"{options.out} cannot be written: is {place} a folder of yours?")
+    run = load(options.run, options.checkpoint, options.engine)
+    arrays = record(run.restored.setup, run.state, options.seed, options.episodes)
+    with options.out.open("wb") as file:  # by its name, numpy would give it another
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+    for name, array in arrays.items():
+        print(f"{name:32} {array.dtype} {list(array.shape)}")
+    print(options.out)
+
+
+if __name__ == "__main__":
+    leave(main)

@@ -1,0 +1,180 @@
+"""A run read back from its folder: its policy, its metrics, its evaluation."""
+
+import functools
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from purerl.core.errors import UserError, one_line
+
+if TYPE_CHECKING:
+    from purerl.core.env import Env
+    from purerl.core.records import Network, TrainState
+    from purerl.ppo.config import Config
+    from purerl.runs import run_folder
+    from purerl.runs.experiment import Experiment
+    from purerl.runs.policy import Policy
+
+
+def load(folder: Path | str, checkpoint: str = "latest", engine: str = "") -> "Run":
+    """Reads a run back from its folder alone; nothing in it is changed.
+
+    Args:
+      folder: the run's folder, such as "runs/ant_run/seed1".
+      checkpoint: "latest", "best" (highest evaluation return), or an update's number.
+      engine: a physics engine, where it should not be the run's own.
+
+    Raises:
+      UserError: the folder holds no run.
+
+    >>> run = load(folder)
+    >>> observation = np.zeros(5)
+    >>> run.policy(observation).shape
+    (1,)
+    >>> run.metrics()["update"][-1]
+    2
+    """
+    folder = Path(folder)
+    if not (folder / "config.json").is_file():
+        from purerl.runs.run_folder import check_is_run
+
+        check_is_run(folder)
+    return Run(folder, str(checkpoint), engine)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run read back; what it holds is built when it is first asked for."""
+
+    folder: Path
+    checkpoint: str = "latest"
+    engine: str = ""  # "": the run's own
+
+    @functools.cached_property
+    def restored(self) -> "run_folder.RestoredRun":
+        """The experiment rebuilt, and the checkpoint."""
+        from purerl.devices.compilation import set_up_jax
+        from purerl.runs.run_folder import restore
+
+        set_up_jax(cache=True)
+        return restore(self.folder, self.checkpoint, print, self.engine)
+
+    @property
+    def experiment(self) -> "Experiment":
+        """The experiment, with the run's settings."""
+        return self.restored.experiment
+
+    @property
+    def config(self) -> "Config":
+        """The settings of PPO."""
+        return self.restored.setup.config
+
+    @property
+    def env(self) -> "Env":
+        """One environment."""
+        return self.restored.setup.env
+
+    @property
+    def network(self) -> "Network":
+        """The network's functions."""
+        return self.restored.setup.network
+
+    @property
+    def state(self) -> "TrainState":
+        """The checkpoint's state, without environments, episodes and optimizer."""
+        return self.restored.saved.state
+
+    @property
+    def update(self) -> int:
+        """Updates done."""
+        return self.restored.saved.meta["update"]
+
+    @property
+    def steps(self) -> int:
+        """Control steps taken, all environments together."""
+        return self.restored.saved.meta["steps"]
+
+    @property
+    def digest(self) -> str:
+        """The sha256 of the whole state that was saved."""
+        return self.restored.saved.meta["digest"]
+
+    @functools.cached_property
+    def policy(self) -> "Policy":
+        """The policy, at the start of an episode."""
+        from purerl.runs.policy import Policy
+
+        return Policy(self.env, self.network, self.state)
+
+    def metrics(self) -> dict[str, list[Any]]:
+        """Returns metrics.jsonl as columns, None where a line lacks one; JAX is not needed.
+
+        `pandas.DataFrame(run.metrics())` makes a table of them.
+        """
+        lines = read_metrics(self.folder / "metrics.jsonl")
+        names = dict.fromkeys(name for line in lines for name in line)
+        return {name: [line.get(name) for line in lines] for name in names}
+
+    def evaluate(
+        self, episodes: int = 100, seed: int = 0, stochastic: bool = False
+    ) -> dict[str, Any]:
+        """Evaluates on whole episodes in fresh environments, as `python -m purerl.evaluate` does.
+
+        Args:
+          episodes: N, each in an environment of its own.
+          seed: of the episodes; it never meets a seed of training.
+          stochastic: sample actions instead of taking the distribution's centre.
+
+        Returns:
+          "metrics": name -> {"mean", "std", "min", "max", "values" [N]}, "episode_return" among
+          them, and what was evaluated: "run", "update", "steps", "digest", "engine", ...
+        """
+        import jax
+        import numpy as np
+
+        from purerl.core.keys import Purpose, derive
+        from purerl.ppo.evaluation import evaluate
+
+        if episodes < 1:
+            raise UserError(f"episodes is {episodes}; it must be at least 1.")
+        config, env, network, engine = self.restored.setup
+
+        def judge(state: Any, key: Any) -> dict[str, Any]:
+            return evaluate(config, env, network, state, key, episodes, not stochastic)
+
+        key = derive(jax.random.key(seed), Purpose.EVALUATION)
+        values = jax.device_get(jax.jit(judge)(self.state, key))
+        return {
+            "run": str(self.folder),
+            "update": self.update,
+            "steps": self.steps,
+            "digest": self.digest,
+            "engine": engine,
+            "seed": seed,
+            "policy": "stochastic" if stochastic else "deterministic",
+            "episodes": episodes,
+            "metrics": {n: statistics(np.asarray(x, float)) for n, x in sorted(values.items())},
+        }
+
+
+def statistics(values: Any) -> dict[str, Any]:
+    """Summarises one metric of all episodes, [N]; std is over the episodes (divided by N)."""
+    return {
+        "mean": float(values.mean()),
+        "std": float(values.std()),
+        "min": float(values.min()),
+        "max": float(values.max()),
+        "values": values.tolist(),
+    }
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Reads whole lines of metrics.jsonl: a run that is being written may end in half a line."""
+    if not path.exists():
+        return []
+    texts = path.read_text().split("\n")[:-1]
+    try:
+        return [json.loads(text) for text in texts]
+    except ValueError as error:
+        raise UserError(f"{path} has a line that is no JSON: {one_line(error)}") from error

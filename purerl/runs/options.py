@@ -1,0 +1,72 @@
+"""Options of commands: how a run is made, kept and shown, and how its policy is played."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass(frozen=True)
+class PlayOptions:
+    """Which run's policy is played, from which checkpoint, and where."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """The run's folder, such as runs/ant/seed1."""
+    checkpoint: str = "latest"
+    """latest, best (highest evaluation return), or an update's number."""
+    seed: int = 0
+    """Seed of the episodes; never meets a seed of training."""
+    engine: Literal["", "auto", "c", "jax", "warp"] = ""
+    """Physics engine, where it should not be the run's own."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a run is made, kept and shown; only vmapped seeds and num_shards change its bits."""
+
+    name: str | None = None
+    """Name of the run, the folder under runs/<experiment>/ (default: seed<seed>)."""
+    num_seeds: int = 1
+    """Train this many seeds, from --seed upwards, each in a run's folder of its own."""
+    seeds_by: Literal["vmap", "map"] = "vmap"
+    """vmap: all in one program, with the statistics of single runs but other bits; map: one after
+    another, with the bits of single runs."""
+    num_shards: int = 0
+    """Cut the environments into this many parts, a multiple of the devices that share them: on any
+    number of devices the bits are the same. 0: a part for each device; 1: use one device."""
+    distributed: str = ""
+    """One of several processes that train together: auto (SLURM, Open MPI, ...), or
+    HOST:PORT,NUM_PROCESSES,PROCESS_ID, HOST being that of process 0, which alone writes the run."""
+    resume: bool = False
+    """Go on from the last whole checkpoint of the run."""
+    allow_changes: bool = False
+    """Resume although settings, versions or device differ; written down in manifest.json."""
+    runs: Path = Path("runs")
+    """Folder of all runs."""
+    log_every: int = 0
+    """Updates between two lines of metrics.jsonl; 0: chosen for about 500 lines."""
+    checkpoints: int = 10
+    """Checkpoints over the run, evenly spaced, the last one at the end."""
+    keep: int = 3
+    """Newest checkpoints to keep, besides the best one by evaluation."""
+    tensorboard: bool = False
+    """Write TensorBoard files too (needs purerl[tensorboard])."""
+    wandb: Literal["off", "online", "offline"] = "off"
+    """Send metrics to Weights & Biases too (needs purerl[wandb])."""
+    wandb_project: str = "purerl"
+    """The W&B project."""
+    video: bool = False
+    """Make a video at each evaluation, in a process of low priority (see purerl.render)."""
+    cache: bool = True
+    """Whether compiled programs are kept, in JAX_COMPILATION_CACHE_DIR, else in purerl/jax in
+    XDG_CACHE_HOME or ~/.cache."""
+
+    def __post_init__(self) -> None:
+        """Checks the rules."""
+        for name, least in _LEAST.items():
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}.")
+
+
+_LEAST = {"num_seeds": 1, "num_shards": 0, "log_every": 0, "checkpoints": 0, "keep": 1}

@@ -1,0 +1,102 @@
+"""What a run has learned, as a function from numpy to numpy."""
+
+import math
+from typing import Any
+
+import jax
+import numpy as np
+
+from purerl.core.env import Env
+from purerl.core.errors import UserError
+from purerl.core.records import Array, Network, PyTree, TrainState
+from purerl.ppo import distributions, running_moments
+from purerl.ppo.rollout import start_memory
+
+
+class Policy:
+    """A policy in use: `policy(observation) -> action`.
+
+    A recurrent policy carries its memory from call to call: `reset` it before each episode.
+
+    >>> policy = load(folder).policy
+    >>> policy.reset()
+    >>> policy(np.zeros((3, 5))).shape  # of 3 environments
+    (3, 1)
+    """
+
+    def __init__(self, env: Env, network: Network, state: TrainState) -> None:
+        """Prepares a policy at the start of an episode.
+
+        Args:
+          env: for the shapes of an observation.
+          network: the network.
+          state: for `params` and `normalizer`, and the shape of one environment's memory.
+        """
+
+        def act(state: TrainState, observation: PyTree, memory: PyTree, key: Any) -> Any:
+            observation = running_moments.normalize(state.normalizer, observation)
+            output, memory = network.apply(state.params, observation, memory)
+            raw = output.distribution.loc
+            if key is not None:
+                raw = distributions.sample(output.distribution, jax.random.normal(key, raw.shape))
+            return distributions.to_action(raw), memory
+
+        self._example = jax.eval_shape(env.reset, jax.random.key(0)).observation
+        self._state, self._act = state, jax.jit(act)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets: the next observation begins an episode."""
+        self._memory: PyTree = None
+        self._batch: tuple[int, ...] = ()
+
+    def __call__(self, observation: Any, key: Array | None = None) -> np.ndarray:
+        """Chooses an action, and moves the memory on.
+
+        Args:
+          observation: as the environment gives it, an array [..., O] or a dict of them: of one
+            environment, or of several with leading axes.
+          key: None for the distribution's centre; a typed key [] to sample.
+
+        Returns:
+          Actions [..., A] in [-1, 1], float32.
+
+        Raises:
+          UserError: the observation has another shape, or another number of environments than
+            the memory.
+        """
+        batch, flat = flatten(observation, self._example)
+        if self._memory is None:
+            self._memory, self._batch = start_memory(self._state.carry, math.prod(batch)), batch
+        elif batch != self._batch and jax.tree.leaves(self._memory):
+            raise UserError(
+                f"The policy remembers environments {list(self._batch)}, and the observation is "
+                f"of {list(batch)}: call reset() before an episode."
+            )
+        action, self._memory = self._act(self._state, flat, self._memory, key)
+        return np.asarray(action).reshape(*batch, action.shape[-1])
+
+
+def flatten(observation: Any, example: PyTree) -> tuple[tuple[int, ...], PyTree]:
+    """Returns an observation's leading axes, and its leaves with one axis in their place.
+
+    Args:
+      observation: leaves [..., O].
+      example: the shapes of one environment's, leaves [O].
+    """
+    try:
+        arrays = jax.tree.map(lambda _, x: np.asarray(x, np.float32), example, observation)
+    except (TypeError, ValueError):
+        arrays = None
+    pairs = list(zip(jax.tree.leaves(arrays), jax.tree.leaves(example), strict=False))
+    batches = {x.shape[: max(x.ndim - one.ndim, 0)] for x, one in pairs}
+    if len(batches) != 1 or any(x.shape[-one.ndim :] != one.shape for x, one in pairs):
+        is_list = lambda x: isinstance(x, list)  # noqa: E731
+        given = jax.tree.map(np.shape, observation, is_leaf=is_list)
+        wanted = jax.tree.map(np.shape, example)
+        raise UserError(
+            f"The observation's shape is {given}; it must be {wanted}, with the same leading axes "
+            "everywhere for several environments."
+        )
+    flat = jax.tree.map(lambda x, one: x.reshape(-1, *one.shape), arrays, example)
+    return batches.pop(), flat

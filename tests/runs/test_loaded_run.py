@@ -1,0 +1,157 @@
+"""`purerl.load`: a run read back, and its policy in use."""
+
+import dataclasses
+import doctest
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import purerl
+from purerl import evaluate
+from purerl.core.keys import Purpose, derive, per_environment
+from purerl.runs import experiment, loaded_run, policy, training
+from tests.golden import privileged, recurrent
+
+ROOT = Path(__file__).parent.parent.parent
+FEW = {"ppo.num_steps": 512, "network.value_hidden": (8,), "evaluation.number": 0}
+
+
+@pytest.fixture(scope="module", params=[recurrent, privileged], ids=["memory", "dict"])
+def run(request, tmp_path_factory) -> purerl.Run:
+    place = tmp_path_factory.mktemp(request.param.__name__)
+    return purerl.train(request.param.experiment, FEW, runs=place)
+
+
+def first_keys(seed: int, number: int):
+    """Keys of the starts of an evaluation's episodes."""
+    key = derive(jax.random.key(seed), Purpose.EVALUATION)
+    return per_environment(jax.random.split(key)[0], number)
+
+
+def test_its_actions_are_those_of_an_evaluation(run):
+    """The episodes are played from Python, an action at a time."""
+    judged = run.evaluate(episodes=3, seed=5)["metrics"]
+    step, state = jax.jit(jax.vmap(run.env.step)), jax.vmap(run.env.reset)(first_keys(5, 3))
+    run.policy.reset()
+    returns = np.zeros(3)
+    for _ in range(run.config.episode_length):
+        observation = jax.tree.map(np.asarray, state.observation)
+        action = run.policy(observation)
+        assert isinstance(action, np.ndarray) and action.shape == (3, 1)
+        state = step(state, jnp.asarray(action))
+        returns += np.asarray(state.reward)
+    np.testing.assert_allclose(returns, judged["episode_return"]["values"], rtol=1e-5)
+    assert np.std(returns) > 1e-3
+
+
+def test_one_observation_or_several_give_the_same(run):
+    state = jax.vmap(run.env.reset)(first_keys(0, 6))
+    many = jax.tree.map(lambda x: np.asarray(x).reshape(2, 3, *x.shape[1:]), state.observation)
+    run.policy.reset()
+    first, second = run.policy(many), run.policy(many)
+    assert first.shape == (2, 3, 1)
+    run.policy.reset()
+    one = [run.policy(jax.tree.map(lambda x: x[1, 2], many)) for _ in range(2)]
+    assert one[0].shape == (1,)
+    np.testing.assert_allclose(one, [first[1, 2], second[1, 2]], rtol=1e-5, atol=1e-7)
+    remembers = len(jax.tree.leaves(run.state.carry)) > 0
+    assert (np.abs(first - second).max() > 1e-6) == remembers
+    if remembers:
+        with pytest.raises(purerl.UserError, match=r"remembers environments \[\].*call reset"):
+            run.policy(many)
+    run.policy.reset()
+    np.testing.assert_array_equal(run.policy(many), first)
+
+
+def test_a_key_samples(run):
+    state = run.env.reset(jax.random.key(0))
+    run.policy.reset()
+    centre = run.policy(state.observation)
+    actions = []
+    for seed in (1, 1, 2):
+        run.policy.reset()
+        actions.append(run.policy(state.observation, jax.random.key(seed)))
+    assert actions[0] == actions[1] != actions[2] and centre not in actions
+
+
+def test_a_wrong_observation_is_one_line(run):
+    right = jax.eval_shape(run.env.reset, jax.random.key(0)).observation
+    wrong = [np.zeros(4), np.zeros(()), {"policy": np.zeros(9)}, [0.0, 1.0], None, "x"]
+    if isinstance(right, dict):
+        wrong.append({"policy": np.zeros((2, 3)), "velocity": np.zeros((3, 2))})
+    for observation in wrong:
+        with pytest.raises(purerl.UserError, match="it must be ") as error:
+            run.policy(observation)
+        assert "\n" not in str(error.value)
+
+
+def test_it_evaluates_as_the_command_does(run, tmp_path):
+    file = tmp_path / "judged.json"
+    words = ["--episodes", "4", "--seed", "2", "--stochastic", "--json", str(file)]
+    assert evaluate.main([str(run.folder), *words]) == 0
+    again = purerl.load(run.folder).evaluate(episodes=4, seed=2, stochastic=True)
+    assert json.loads(file.read_text()) == again
+    with pytest.raises(purerl.UserError, match="episodes is 0"):
+        run.evaluate(0)
+
+
+def test_a_checkpoint_and_an_engine_can_be_chosen(run):
+    first = purerl.load(str(run.folder), checkpoint=1)
+    assert first.update == 1 < run.update and first.digest != run.digest
+    with pytest.raises(purerl.UserError, match="no checkpoint '77'"):
+        purerl.load(run.folder, checkpoint="77").state  # noqa: B018
+    assert purerl.load(run.folder, engine="c").evaluate(1)["engine"] == "c"
+
+
+def test_metrics_are_columns_of_one_length(run, tmp_path):
+    columns = run.metrics()
+    assert columns["update"] == list(range(1, run.update + 1))
+    assert {len(column) for column in columns.values()} == {run.update}
+    assert None in columns["digest"] or len(columns["digest"]) == run.update
+    file = tmp_path / "metrics.jsonl"
+    file.write_text('{"update": 1, "a": 0.5}\n{"update": 2, "b": null}\n{"update": 3, "a"')
+    assert purerl.Run(tmp_path).metrics() == {
+        "update": [1, 2], "a": [0.5, None], "b": [None, None]
+    }  # fmt: skip
+
+
+def test_metrics_start_no_jax(run):
+    code = (
+        "import sys, purerl; found = purerl.load(sys.argv[1]).metrics();"
+        "print(len(found['update']), 'jax' in sys.modules)"
+    )
+    command = [sys.executable, "-c", code, str(run.folder)]
+    said = subprocess.check_output(command, text=True, cwd=ROOT)
+    assert said.split() == [str(run.update), "False"]
+
+
+def test_a_folder_without_a_run_is_one_line(run, tmp_path):
+    with pytest.raises(purerl.UserError, match="is no run: it has no config.json.$"):
+        purerl.load(tmp_path)
+    with pytest.raises(purerl.UserError, match="Runs in it: "):
+        purerl.load(run.folder.parent)
+
+
+def test_the_examples_in_the_docstrings_hold(tmp_path, capsys):
+    names = {"train": training.train, "load": loaded_run.load, "np": np, "place": tmp_path}
+    names |= {"find": experiment.find, "folder": tmp_path / "cartpole_swingup" / "first"}
+    finder, runner = doctest.DocTestFinder(recurse=False), doctest.DocTestRunner()
+    for thing in (experiment.find, training.train, loaded_run.load, policy.Policy):
+        (test,) = finder.find(thing, globs=dict(names))
+        assert test.examples
+        runner.run(test)
+    assert runner.failures == 0, capsys.readouterr().out
+
+
+def test_a_policy_needs_no_run(run):
+    made = purerl.Policy(run.config, run.env, run.network, run.state)
+    observation = run.env.reset(jax.random.key(3)).observation
+    run.policy.reset()
+    np.testing.assert_array_equal(made(observation), run.policy(observation))
+    assert dataclasses.is_dataclass(run)

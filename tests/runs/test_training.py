@@ -1,0 +1,342 @@
+"""`purerl.train`: the folder, bits and lines of the command."""
+
+import contextlib
+import dataclasses
+import functools
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import purerl
+from purerl import compare, evaluate, record, render, run
+from purerl.core.errors import USAGE
+from purerl.exact import xla_flags
+from purerl.runs import experiment_file, training
+from purerl.runs.command_line import from_settings
+from purerl.runs.experiment import Experiment, Source, from_json, to_json
+from purerl.runs.experiment import settings as settings_of
+from purerl.runs.options import Options
+from tests.runs import toy_experiment
+
+TOY = Path(__file__).parent / "toy_experiment.py"
+ROOT = TOY.parent.parent.parent
+SETTINGS = {"seed": 3, "env.steps": 3, "network.policy_hidden": (5, 6), "ppo.learning_rate": 1e-3}
+WORDS = [
+    "--seed",
+    "3",
+    "--env.steps",
+    "3",
+    "--network.policy-hidden",
+    "5",
+    "6",
+    "--ppo.learning-rate",
+    "1e-3",
+]
+
+
+def told(said: str) -> list[str]:
+    """Returns what a run printed, without its clock and its folder."""
+    lines = [line for line in said.splitlines() if not line.startswith(("Compiled", "run  "))]
+    return [re.sub(r"  [\d,]+ steps/s .*", "", line) for line in lines]
+
+
+def written(folder: Path) -> dict:
+    """Returns what a run's files say, without its id and its clock."""
+    manifest = json.loads((folder / "manifest.json").read_text())
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return {
+        "config": (folder / "config.json").read_text(),
+        "manifest": {k: v for k, v in manifest.items() if k != "run_id"},
+        "metrics": [{k: v for k, v in line.items() if k != "wall_s"} for line in lines],
+        "experiment": (folder / "experiment.py").read_bytes(),
+        "files": sorted(path.name for path in folder.iterdir()),
+    }
+
+
+def test_it_makes_the_same_run_as_the_command(tmp_path):
+    """Each in a process of its own, as users have it; in the one, JAX has begun before."""
+    script = (
+        "import sys, jax, purerl\n"
+        "jax.numpy.ones(2).sum()\n"
+        f"run = purerl.train(sys.argv[1], {SETTINGS}, runs=sys.argv[2], checkpoints=2)\n"
+    )
+    python = [sys.executable, "-c", script, str(TOY), str(tmp_path / "python")]
+    words = [*WORDS, "--runs", str(tmp_path / "command"), "--checkpoints", "2"]
+    command = [sys.executable, "-m", "purerl.run", str(TOY), *words]
+    said = [subprocess.check_output(each, cwd=ROOT, text=True) for each in (python, command)]
+    assert told(said[0]) == told(said[1]) and "bit-exact    yes" in said[0]
+    folders = [tmp_path / by / "toy_experiment" / "seed3" for by in ("python", "command")]
+    assert written(folders[0]) == written(folders[1])
+    assert "digest" in written(folders[0])["metrics"][-1]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> purerl.Run:
+    return purerl.train(str(TOY), SETTINGS, runs=tmp_path_factory.mktemp("train"))
+
+
+def test_it_returns_the_run(trained):
+    assert isinstance(trained, purerl.Run) and trained.folder.name == "seed3"
+    assert (trained.update, trained.steps) == (12, 384)
+    assert trained.experiment.env.steps == 3 and trained.config.learning_rate == 1e-3
+    assert trained.metrics()["digest"][-1] == trained.digest
+
+
+def test_a_run_that_is_done_is_returned_at_once(trained, capsys):
+    again = purerl.train(str(TOY), SETTINGS, runs=trained.folder.parent.parent, resume=True)
+    assert again.digest == trained.digest
+    assert "Already done" in capsys.readouterr().out
+
+
+def test_a_run_that_was_stopped_goes_on(trained, tmp_path, monkeypatch):
+    asked = iter([False, False, True])
+    stop = lambda _: contextlib.nullcontext(lambda: next(asked, True))  # noqa: E731
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "stop_signals", stop)
+        with pytest.raises(purerl.StoppedError, match="it is saved"):
+            purerl.train(str(TOY), SETTINGS, runs=tmp_path)
+    run_ = purerl.train(str(TOY), SETTINGS, runs=tmp_path, resume=True)
+    assert run_.digest == trained.digest
+
+
+def test_several_seeds_are_several_runs(trained, tmp_path):
+    options = {"num_seeds": 2, "seeds_by": "map", "name": "many", "runs": tmp_path}
+    first, second = purerl.train(str(TOY), SETTINGS, **options)
+    assert (first.folder.name, second.folder.name) == ("many-seed3", "many-seed4")
+    assert first.digest == trained.digest != second.digest
+
+
+def test_it_trains_in_a_thread(trained, tmp_path):
+    found = []
+
+    def work():
+        found.append(purerl.train(str(TOY), SETTINGS, runs=tmp_path))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert found[0].digest == trained.digest
+
+
+@pytest.mark.parametrize(
+    ("changes", "options", "message"),
+    [
+        ({"ppo.num_step": 3}, {}, "no option --ppo.num-step. Did you mean --ppo.num-steps?"),
+        ({"ppo": 3}, {}, "no option --ppo."),
+        ({"ppo.num_steps": "many"}, {}, "num-steps: invalid literal"),
+        ({"ppo.gamma": 1.5}, {}, "gamma is 1.5; it must be in [0, 1]"),
+        ({"ppo.schedule": "cubic"}, {}, "Expected one of ('constant'"),
+        ({"env.steps": None}, {}, "env.steps"),
+        ({}, {"num_seed": 2}, "no option --num-seed. Did you mean --num-seeds?"),
+        ({}, {"keep": 0}, "keep is 0; it must be at least 1"),
+        ({}, {"cache": "perhaps"}, "cache"),
+        ({}, {"resume": True}, "There is no run"),
+    ],
+)
+def test_a_mistake_is_one_line_and_nothing_is_written(tmp_path, changes, options, message):
+    with pytest.raises(purerl.UserError) as error:
+        purerl.train(str(TOY), changes, runs=tmp_path, **options)
+    assert message in str(error.value) and "\n" not in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
+@dataclasses.dataclass(frozen=True)
+class Inner:
+    ratio: float = 0.5
+    mode: Literal["a", "b"] = "a"
+
+
+@dataclasses.dataclass(frozen=True)
+class Kinds:
+    """Settings of every kind."""
+
+    flag: bool = True
+    count: int = 1
+    size: float = 1.0
+    text: str = "x"
+    widths: tuple[int, ...] = (3,)
+    span: tuple[float, float] = (0.0, 1.0)
+    limit: float | None = 2.0
+    inner: Inner = Inner()
+
+
+FLOATS = st.floats(allow_nan=False, width=64)
+KINDS = st.builds(
+    Kinds,
+    st.booleans(),
+    st.integers(-(10**12), 10**12),
+    FLOATS,
+    st.text("abc XYZ_./", min_size=1).filter(lambda text: text != "None"),
+    st.lists(st.integers(), max_size=3).map(tuple),
+    st.tuples(FLOATS, FLOATS),
+    FLOATS | st.none(),
+    st.builds(Inner, FLOATS, st.sampled_from("ab")),
+)
+BASE = dataclasses.replace(toy_experiment.experiment, env=Kinds())
+
+
+def named(env: Kinds) -> dict:
+    values = {f"env.{f.name}": getattr(env, f.name) for f in dataclasses.fields(Kinds)}
+    inner = values.pop("env.inner")
+    return values | {"env.inner.ratio": inner.ratio, "env.inner.mode": inner.mode}
+
+
+@settings(deadline=None, max_examples=60)
+@given(KINDS)
+def test_settings_by_name_are_the_settings(env):
+    chosen, options = from_settings(Source(BASE, "kinds", TOY), named(env), {"num_seeds": 2})
+    assert chosen == dataclasses.replace(BASE, env=env) and options == Options(num_seeds=2)
+    assert isinstance(chosen.env.size, float)
+
+
+@settings(deadline=None)
+@given(KINDS)
+def test_settings_survive_json(env):
+    chosen = dataclasses.replace(BASE, env=env)
+    assert from_json(BASE, json.loads(json.dumps(to_json(chosen)))) == chosen
+
+
+@settings(deadline=None)
+@given(KINDS)
+def test_a_written_file_rebuilds_the_experiment(env):
+    chosen = dataclasses.replace(BASE, env=env)
+    namespace: dict = {}
+    exec(experiment_file.source_text(chosen), namespace)
+    assert namespace["experiment"] == chosen
+
+
+def test_an_experiment_found_is_its_file(trained, tmp_path):
+    found = purerl.find(str(TOY))
+    assert purerl.find(str(TOY)) is not found  # loaded twice
+    by_object = purerl.train(found, SETTINGS, runs=tmp_path)
+    assert by_object.folder == tmp_path / "toy_experiment" / "seed3"
+    first, second = written(trained.folder), written(by_object.folder)
+    assert first == second
+
+
+def test_an_experiment_made_in_python_has_a_file_that_rebuilds_it(trained, tmp_path, capsys):
+    env = dataclasses.replace(toy_experiment.experiment.env, steps=3)
+    mine = dataclasses.replace(toy_experiment.experiment, env=env)
+    made = purerl.train(mine, SETTINGS, name="made", runs=tmp_path)
+    assert made.folder == tmp_path / "experiment" / "made"
+    assert made.digest == trained.digest
+    text = (made.folder / "experiment.py").read_text()
+    assert "import tests.runs.toy_experiment\n" in text and "import purerl\n" in text
+    assert "purerl.networks.mlp" in text and "purerl.ppo" not in text
+    capsys.readouterr()
+    assert evaluate.main([str(made.folder), "--episodes", "2"]) == 0
+    assert "any more" not in capsys.readouterr().out
+    assert purerl.train(mine, SETTINGS, name="made", runs=tmp_path, resume=True).digest
+
+
+def test_an_experiment_whose_module_was_loaded_again_still_has_a_file(monkeypatch):
+    first = purerl.find("tests.runs.toy_experiment")
+    monkeypatch.delitem(sys.modules, "tests.runs.toy_experiment")
+    second = purerl.find("tests.runs.toy_experiment")
+    assert first.build_env is not second.build_env
+    for one in (first, second):
+        with experiment_file.source_of(dataclasses.replace(one, seed=7)) as source:
+            assert "import tests.runs.toy_experiment" in source.path.read_text()
+
+
+def local(*arguments):
+    raise AssertionError
+
+
+def replaced(*arguments):
+    raise AssertionError
+
+
+was_replaced = replaced
+
+
+def replaced(*arguments):  # noqa: F811
+    raise ValueError
+
+
+def in_main(*arguments):
+    raise AssertionError
+
+
+in_main.__module__ = "__main__"
+
+
+@pytest.mark.parametrize(
+    "build", [lambda *_: None, in_main, functools.partial(local), was_replaced]
+)
+def test_a_builder_that_no_file_can_import_is_one_line(build, tmp_path):
+    mine = dataclasses.replace(toy_experiment.experiment, build_env=build)
+    with pytest.raises(purerl.UserError, match="build_env is .*put it into a .py file") as error:
+        purerl.train(mine, runs=tmp_path)
+    assert "\n" not in str(error.value) and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"), [("", True), ("--xla_gpu_autotune_level=0", False), ("--other", True)]
+)
+def test_flags_that_come_too_late_for_a_gpu_are_not_claimed(monkeypatch, capsys, flags, said):
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    monkeypatch.setattr(training, "_runs_on_gpu", lambda: True)
+    training.set_xla_flags_in_time()
+    assert ("not bit-exact" in capsys.readouterr().out) == said
+    assert (xla_flags.how_chosen("gpu") == "by timing") == said
+    monkeypatch.setattr(training, "_runs_on_gpu", lambda: False)
+    training.set_xla_flags_in_time()
+    assert xla_flags.how_chosen("gpu") == "fixed" and not capsys.readouterr().out
+
+
+def test_a_second_signal_interrupts_and_the_handlers_come_back(capsys):
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), training.stop_signals(training._interrupt) as stop:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop()
+        os.kill(os.getpid(), signal.SIGTERM)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_run_from_before_the_move_is_one_line(trained, tmp_path, capsys):
+    old = tmp_path / "old"
+    subprocess.run(["cp", "-r", str(trained.folder), str(old)], check=True)
+    text = (old / "experiment.py").read_text()
+    older = text.replace("from purerl.ppo.config import", "from purerl.config import")
+    assert older != text
+    (old / "experiment.py").write_text(older)
+    line = older[: older.index("purerl.config")].count("\n") + 1
+    message = (
+        f"purerl: {old}/experiment.py, line {line}: purerl.config has moved, or never was: write "
+        "`from purerl import Config`. The run was made by an older purerl: train it anew.\n"
+    )
+    for command in (evaluate, render, record):
+        assert command.main([str(old)]) == USAGE
+        assert capsys.readouterr().err == message
+    with pytest.raises(purerl.UserError, match="train it anew"):
+        purerl.load(old).state  # noqa: B018
+    assert compare.main([str(old)]) == 0  # it reads what the run wrote, and nothing else
+    assert len(purerl.load(old).metrics()["update"]) == 12
+    capsys.readouterr()
+    facts = json.loads((old / "manifest.json").read_text())
+    facts["source"] = {f"purerl.old{i}": value for i, value in enumerate(facts["source"].values())}
+    (old / "manifest.json").write_text(json.dumps(facts))
+    words = [str(TOY), *WORDS, "--runs", str(tmp_path), "--resume"]
+    (tmp_path / "toy_experiment").mkdir()
+    old.rename(tmp_path / "toy_experiment" / "seed3")
+    assert run.main(words) == USAGE
+    said = capsys.readouterr().err
+    assert "as of another version of purerl" in said and "train anew" in said
+    assert len(said.splitlines()) <= 5, said
+
+
+def test_types_of_settings_have_no_name_of_an_option():
+    names = {field.name for field in dataclasses.fields(Experiment)}
+    assert not names & {field.name for field in dataclasses.fields(Options)}
+    assert "seed" in settings_of(BASE)
