@@ -32,8 +32,8 @@ def rules(platform: str) -> list[Rule]:
     if platform not in pallas_calls.GPUS:
         return [counted]
     kernels = (fused_solves, fused_loops) if pallas_calls.can_run(platform) else ()
-    gathers, loops = Rule(puts, _gather_of_put), Rule(is_written_out, _short_scan)
-    return [*(_kernel(module, platform) for module in kernels), gathers, loops, counted]
+    gathers, scans = Rule(puts, _gather_of_put), Rule(_is_short_or_reads_tall, _faster_scan)
+    return [*(_kernel(module, platform) for module in kernels), gathers, scans, counted]
 
 
 def _kernel(module: ModuleType, platform: str) -> Rule:
@@ -43,28 +43,30 @@ def _kernel(module: ModuleType, platform: str) -> Rule:
     """
 
     def replace(eqn, inputs, known, inside):
-        if not module.wanted(eqn):
-            return None
         return with_own_derivative(eqn, functools.partial(module.compute, eqn, platform), inputs)
 
     return Rule(module.wanted, replace)
 
 
 def _gather_of_put(eqn, inputs, known, inside) -> list | None:
-    if not puts(eqn) or known[1] is None:
-        return None
-    return [gathered_scatter(eqn, inputs, known)]
+    return None if known[1] is None else [gathered_scatter(eqn, inputs, known)]
 
 
-def _short_scan(eqn, inputs, known, inside) -> list | None:
+def _is_short_or_reads_tall(eqn: core.JaxprEqn) -> bool:
+    return is_written_out(eqn) or (eqn.primitive.name == "scan" and any(_tall_constants(eqn)))
+
+
+def _tall_constants(eqn: core.JaxprEqn) -> list[bool]:
+    """Tells of each input of a scan whether it is a constant to be transposed."""
+    n, _ = walk.scan_sizes(eqn.params)
+    return [i < n and is_tall(v.aval.shape) for i, v in enumerate(eqn.invars)]
+
+
+def _faster_scan(eqn, inputs, known, inside) -> list:
     """Computes a scan with rounds written out if it is short, and tall constants transposed."""
-    if eqn.primitive.name != "scan":
-        return None
-    params = eqn.params
+    params, tall = eqn.params, _tall_constants(eqn)
     if is_written_out(eqn):
         params = params | {"unroll": min(WRITTEN_OUT, params["length"])}
-    n, _ = walk.scan_sizes(params)
-    tall = [i < n and is_tall(x) for i, x in enumerate(inputs)]
 
     def turn(values):
         return [jnp.transpose(x) if t else x for x, t in zip(values, tall, strict=True)]
@@ -81,7 +83,7 @@ def _is_while(eqn: core.JaxprEqn) -> bool:
 
 def _scan_of_while(eqn, inputs, known, inside) -> list | None:
     """Computes a `while` that makes few rounds at most by a scan."""
-    limit = rounds(eqn.params, known) if _is_while(eqn) else None
+    limit = rounds(eqn.params, known)
     if limit is None or limit > MOST_ROUNDS:
         return None
     condition, body, carry = walk.while_parts(eqn.params, inputs, known, inside)

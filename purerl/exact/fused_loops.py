@@ -253,10 +253,6 @@ def _dynamic_slice(long: Long, eqn: core.JaxprEqn, value: Value, start: Value) -
     return [found.reshape(1)]
 
 
-def _squeeze(long: Long, eqn: core.JaxprEqn, value: Value) -> list[Value]:
-    return [value.reshape(_shape(eqn.outvars[0]))]
-
-
 def _cond(long: Long, eqn: core.JaxprEqn, index: Value, *args: Value) -> list[Value]:
     """All branches, then a choice."""
     found, *others = (_evaluate(long, branch, *args) for branch in eqn.params["branches"])
@@ -264,10 +260,6 @@ def _cond(long: Long, eqn: core.JaxprEqn, index: Value, *args: Value) -> list[Va
         chosen = _map(lambda i, n=number: i.astype(jnp.int32) >= n, index)
         found = [_map(jnp.where, chosen, a, b) for a, b in zip(other, found, strict=True)]
     return found
-
-
-def _called(long: Long, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
-    return _evaluate(long, called_jaxpr(eqn), *args)
 
 
 # Not min and max, of which Triton's lose a NaN.
@@ -283,8 +275,8 @@ _RULES: dict[str, Callable[..., list[Value]]] = {
     "reduce_or": functools.partial(_fold, operator.or_),
     "reduce_sum": _sum,
     "slice": _slice,
-    "squeeze": _squeeze,
+    "squeeze": lambda long, eqn, value: [value.reshape(_shape(eqn.outvars[0]))],
     "stack": lambda long, eqn, *values: [np.stack(values, eqn.params["axis"])],
-    **dict.fromkeys(CALLS, _called),
+    **dict.fromkeys(CALLS, lambda long, eqn, *args: _evaluate(long, called_jaxpr(eqn), *args)),
 }
 _OF_SHORT_AXES = ("argmin", "dynamic_slice", "reduce_or", "slice", "squeeze", "stack")

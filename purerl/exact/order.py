@@ -59,19 +59,11 @@ def is_unordered(eqn: core.JaxprEqn) -> bool:
     return sums and jnp.issubdtype(eqn.invars[0].aval.dtype, jnp.inexact)
 
 
-def _in_order(eqn, inputs, known, inside) -> list | None:
-    return [ordered_scatter(eqn, inputs, known)] if is_unordered(eqn) else None
-
-
-RULE = Rule(is_unordered, _in_order)
+RULE = Rule(is_unordered, lambda eqn, inputs, known, _: [ordered_scatter(eqn, inputs, known)])
 
 
 def check_ordered(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
-    """Returns a trace that has no sum without a fixed order.
-
-    Raises:
-      RuntimeError: it has one.
-    """
+    """Returns the trace; raises RuntimeError if it has a sum without a fixed order."""
     left = unordered_in(closed)
     if left:
         raise RuntimeError(

@@ -1,7 +1,5 @@
 """Facts about a loop that its trace tells before it runs."""
 
-from typing import Any
-
 import jax.numpy as jnp
 from jax.extend import core
 
@@ -43,9 +41,9 @@ def is_written_out(eqn: core.JaxprEqn) -> bool:
     return not has_loop(body) and sum(1 for _ in equations(body)) < FEW_EQUATIONS
 
 
-def is_tall(x: Any) -> bool:
+def is_tall(shape: tuple[int, ...]) -> bool:
     """Tells whether an array has many rows of few numbers, [n, k]."""
-    return jnp.ndim(x) == 2 and x.shape[1] <= FEW_COLUMNS and x.shape[0] >= MANY_ROWS
+    return len(shape) == 2 and shape[1] <= FEW_COLUMNS and shape[0] >= MANY_ROWS
 
 
 def rounds(params: dict, known: list[Known]) -> int | None:

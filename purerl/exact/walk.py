@@ -28,11 +28,10 @@ Inside = Callable[..., list]  # (trace, known_args, *args) -> results: the same 
 
 
 class Rule(NamedTuple):
-    """What is replaced, and by what."""
+    """Which equations are replaced, and by what."""
 
-    wants: Callable[[core.JaxprEqn], bool]  # may this equation itself be replaced?
-    # (equation, inputs, known inputs, inside) -> outputs, or None if the rule does not apply. It is
-    # asked about each equation that some rule wants, or that has such an equation inside.
+    wants: Callable[[core.JaxprEqn], bool]
+    # (wanted equation, inputs, known inputs, inside) -> outputs; None: it is not replaced after all
     replace: Callable[[core.JaxprEqn, list, list[Known], Inside], list | None]
 
 
@@ -117,7 +116,7 @@ def _apply(
     if not _is_wanted(rules, eqn):
         return bind_equation(eqn, *inputs)
     for rule in rules:
-        outputs = rule.replace(eqn, inputs, known, inside)
+        outputs = rule.replace(eqn, inputs, known, inside) if rule.wants(eqn) else None
         if outputs is not None:
             return outputs
     if name in CUSTOM_DERIVATIVES:
