@@ -3,9 +3,9 @@
 It serves anybody with plain MJX: `exact.rewrite(mjx.step)`; see docs/exact.md.
 
 What belongs here: code that rewrites a traced function, and the choices of XLA that change bits.
-May import: nothing (of purerl). Read: `rewriting.py` (the public function), `walk.py` (how a trace
-is run again with equations replaced), then the two sets of rules: `order.py` with `scatters.py`,
-the promise, and `fuse.py`, the optimisation. `xla_flags.py` stands alone.
+May import: nothing. Read: `rewriting.py` (the public function), `walk.py` (how a trace is run again
+with equations replaced), then the two sets of rules: `order.py` with `scatters.py`, the promise,
+and `fuse.py`, the optimisation. `xla_flags.py` stands alone.
 """
 
 import importlib
