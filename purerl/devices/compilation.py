@@ -24,11 +24,20 @@ FEW_CORES = 7
 LEVELS = {"init": 0, "collect": 1}
 
 
+def as_it_is(state: Any) -> Any:
+    """Returns a state of one device, which is where it should be."""
+    return state
+
+
 class Compiling(NamedTuple):
-    """An update that is being compiled."""
+    """An update that is being compiled, and how a state gets to it and back."""
 
     finish: Callable[[], Callable[[Any], tuple[Any, Metrics]]]  # waits for it, and returns it
     unordered: list[str]  # its sums without a fixed order
+    judged: PyTree  # shapes of what an evaluation is given
+    spread: Callable[[Any], Any] = as_it_is  # onto several devices
+    fetch: Callable[[Any], Any] = as_it_is  # back onto one
+    to_judge: Callable[[Any], Any] = as_it_is  # what an evaluation needs, onto one
 
 
 def set_up_jax(cache: bool) -> str:

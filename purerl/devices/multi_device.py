@@ -29,13 +29,8 @@ from purerl.ppo.algorithm import Experience
 from purerl.ppo.config import Config
 from purerl.ppo.learner import is_recurrent
 
-PLACES = (
-    "number",
-    "env",
-    "carry",
-    "episode",
-    "discounted_return",
-)  # fields of TrainState that are [B, ...]
+# Fields of TrainState that are [B, ...].
+PLACES = ("number", "env", "carry", "episode", "discounted_return")
 SAME = PartitionSpec()  # a copy on every device
 SPLIT = PartitionSpec(AXIS)
 
@@ -197,25 +192,19 @@ def update(
 
 
 def compile_update(
-    layout: Layout,
+    shards: Shards,
     config: Config,
     env: Env,
     network: Network,
     abstract: TrainState,
     seconds: dict[str, float],
 ) -> Compiling:
-    """Compiles what an update of several shards calls.
+    """Compiles an update of several shards, from the `abstract` shapes of the whole state.
 
-    Args:
-      layout: which device computes which shards.
-      config: the hyperparameters.
-      env: the environment.
-      network: the network.
-      abstract: shapes of the whole state.
-      seconds: "update" is noted in it.
+    How long that takes is noted in `seconds`.
     """
-    begin = time.perf_counter()
-    shards, mesh = layout.shards, layout.mesh
+    begin, layout = time.perf_counter(), make_layout(shards, config.num_envs)
+    mesh = layout.mesh
     learned = abstract.replace(**dict.fromkeys(PLACES))
     collects, experience, sums = compile_collects(layout, config, env, network, abstract)
     improving = jax.jit(
@@ -239,7 +228,16 @@ def compile_update(
         workers = ThreadPoolExecutor(len(collects))
         return functools.partial(update, layout, collects, compiled, workers)
 
-    return Compiling(finish, sorted({*sums, *unordered(traced)}))
+    return Compiling(
+        finish=finish,
+        unordered=sorted({*sums, *unordered(traced)}),
+        judged=shapes(
+            learned.replace(carry=abstract.carry), SingleDeviceSharding(layout.here[0][0])
+        ),
+        spread=functools.partial(spread, layout),
+        fetch=functools.partial(fetch, layout),
+        to_judge=functools.partial(one_copy, layout, abstract.carry),
+    )
 
 
 def compile_collects(
@@ -271,18 +269,6 @@ def compile_collects(
 
 
 def one_copy(layout: Layout, carry: PyTree, state: Spread) -> TrainState:
-    """Returns what an evaluation needs of a state, on one device.
-
-    Args:
-      layout: which device computes which shards.
-      carry: shapes of the policy's memory, which stands among what is spread.
-      state: the state on its devices.
-    """
+    """Returns what an evaluation needs of a state, on one device; `carry`: the memory's shapes."""
     zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), carry)
     return on(layout.here[0][0], state.learned).replace(carry=zeros)
-
-
-def shapes_to_judge(layout: Layout, abstract: TrainState) -> TrainState:
-    """Returns the shapes of `one_copy` of a state, on its device."""
-    needed = abstract.replace(**dict.fromkeys(PLACES) | {"carry": abstract.carry})
-    return shapes(needed, SingleDeviceSharding(layout.here[0][0]))

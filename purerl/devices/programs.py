@@ -18,6 +18,7 @@ from purerl.core.records import Array, Metrics, Network, PyTree, TrainState
 from purerl.devices import multi_device
 from purerl.devices.compilation import (
     Compiling,
+    as_it_is,
     jit,
     no_collection,
     shapes,
@@ -42,8 +43,8 @@ class Programs(NamedTuple):
     evaluate: Callable[[Any], Metrics]
     seconds: dict[str, float]  # that each took to compile, side by side; without the evaluation
     unordered: list[str]  # sums of the update whose order nothing fixes on a GPU
-    spread: Callable[[TrainState], Any] = lambda state: state  # onto the devices, for the others
-    fetch: Callable[[Any], TrainState] = lambda state: state  # back onto one
+    spread: Callable[[TrainState], Any] = as_it_is  # onto the devices, for the others
+    fetch: Callable[[Any], TrainState] = as_it_is  # back onto one
 
 
 def abstract_state(config: Config, env: Env, network: Network) -> PyTree:
@@ -82,35 +83,27 @@ def compile_programs(
     if vmapped_seeds > 1:
         init, judge = jax.vmap(init), jax.vmap(judge)
         key = jax.random.split(key, vmapped_seeds)
-    several = dict[str, Any]()
     with no_collection():
         abstract = jax.eval_shape(init, key)
-        example = abstract
+        task = (config, env, network, abstract)
         if shards.number > 1:
-            layout = multi_device.make_layout(shards, config.num_envs)
-            compiling = multi_device.compile_update(layout, config, env, network, abstract, seconds)
-            seen = functools.partial(multi_device.one_copy, layout, abstract.carry)
-            example = multi_device.shapes_to_judge(layout, abstract)
-            several["spread"] = functools.partial(multi_device.spread, layout)
-            several["fetch"] = functools.partial(multi_device.fetch, layout)
+            compiling = multi_device.compile_update(shards, *task, seconds)
         else:
             in_halves = calls_host or jax.default_backend() == "gpu"
-            compiling = compile_update(
-                config, env, network, abstract, vmapped_seeds > 1, in_halves, seconds
-            )
-            seen = None
+            compiling = compile_update(*task, vmapped_seeds > 1, in_halves, seconds)
         begin, evaluate = jit("init", init), jit("evaluation", judge)
         beginning = start("init", begin.trace(key), seconds) if fresh else None
         if evaluation.number:
-            evaluate = when_needed("evaluation", evaluate, example, seconds)
+            evaluate = when_needed("evaluation", evaluate, compiling.judged, seconds)
         update = compiling.finish()
     return Programs(
         init=beginning.result() if beginning else begin,
         update=update,
-        evaluate=(lambda state: evaluate(seen(state))) if seen else evaluate,
+        evaluate=lambda state: evaluate(compiling.to_judge(state)),
         seconds=dict(seconds),  # the evaluation's may come later
         unordered=compiling.unordered,
-        **several,
+        spread=compiling.spread,
+        fetch=compiling.fetch,
     )
 
 
@@ -131,16 +124,10 @@ def compile_update(
     in_halves: bool,
     seconds: dict[str, float],
 ) -> Compiling:
-    """Compiles an update on one device, as one program or `in_halves`.
+    """Compiles an update on one device, as one program or `in_halves`: acting, then learning.
 
-    Args:
-      config: the hyperparameters.
-      env: the environment.
-      network: the network.
-      abstract: shapes of the state; [S, ...] if `vmapped`.
-      vmapped: whether there are several seeds.
-      in_halves: whether acting and learning are programs of their own.
-      seconds: what each program takes is noted in it.
+    The `abstract` shapes of the state are [S, ...] if `vmapped`. What each program takes is noted
+    in `seconds`.
     """
     whole: list[tuple[str, Callable]] = [
         ("update", functools.partial(algorithm.update, config, env, network))
@@ -160,7 +147,8 @@ def compile_update(
         programs = [program.result() for program in started]
         return functools.partial(update, *programs) if in_halves else programs[0]
 
-    return Compiling(finish, sorted({place for part in traced for place in unordered(part)}))
+    sums = sorted({place for part in traced for place in unordered(part)})
+    return Compiling(finish, sums, judged=abstract)
 
 
 def update(
