@@ -38,6 +38,7 @@ def cut(number, axis, tree):
     return jax.tree.map(lambda x: jnp.stack(jnp.split(x, number, axis)), tree)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CUTS)
 @pytest.mark.parametrize("recurrent, segment_length", [(False, 0), (True, 0), (False, 4)])
 def test_a_gradient_step_is_the_same_in_parts(name, recurrent, segment_length):
@@ -128,6 +129,7 @@ def test_slices_hold_whole_environments():
     assert sliced.sums is experience.sums
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recurrent", [False, True])
 def test_on_a_gpu_an_update_is_two_programs_that_make_the_same(recurrent, monkeypatch):
     env, network, state = setup(recurrent=recurrent)

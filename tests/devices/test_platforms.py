@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 
 from purerl.ppo import algorithm
 from purerl.runs import build_experiment
@@ -10,6 +11,7 @@ from tests.runs import toy_experiment
 from tests.runs.test_run import TOY
 
 
+@pytest.mark.slow
 def test_what_is_learned_otherwise_is_named(tmp_path, monkeypatch):
     file = tmp_path / "there.npz"
     platforms.ask_cpu([str(TOY), "--write", str(file)])

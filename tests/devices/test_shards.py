@@ -81,12 +81,14 @@ def toy(tmp_path_factory) -> Path:
     return runs / "toy_experiment" / "seed1"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("devices", [2, 8])
 def test_a_run_is_the_same_on_any_number_of_devices(toy, tmp_path, devices):
     start(tmp_path, devices, *EIGHT)
     assert lines(tmp_path / "toy_experiment" / "seed1") == lines(toy)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["c", "jax"])
 def test_physics_is_the_same_on_any_number_of_devices(tmp_path, engine):
     words = [*CARTPOLE, "--engine", engine, "--num-shards", "4"]
@@ -99,6 +101,7 @@ def test_physics_is_the_same_on_any_number_of_devices(tmp_path, engine):
     assert one[-1]["train/reward"] > 0 and one[-1]["eval/episode_return"] > 0
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_with_another_number_of_devices(toy, tmp_path):
     """Without --num-shards: the run says how many it was begun with."""
     words = [str(TOY), "--ppo.num-envs", "16", "--checkpoints", "3"]
@@ -128,6 +131,7 @@ def test_by_default_every_device_has_a_shard(tmp_path):
     assert "device_count" not in facts["flags"]["XLA_FLAGS"]
 
 
+@pytest.mark.slow
 def test_the_check_of_a_persons_own_devices():
     """Its short form, on two virtual ones, of segments."""
     words = ["2", "--", str(TOY), "--ppo.segment-length", "2", *TRAINING]
@@ -194,12 +198,14 @@ def test_what_learns_from_several_shards_is_compiled_without_them(monkeypatch):
 # --- several processes ---
 
 
+@pytest.mark.slow
 def test_two_processes_are_as_one(toy, tmp_path):
     first, second = both_end(start_two(tmp_path, *EIGHT), SUCCESS)
     assert lines(tmp_path / "toy_experiment" / "seed1") == lines(toy)
     assert "Digest" in first and "update" not in second  # one speaks for both
 
 
+@pytest.mark.slow
 def test_a_signal_to_one_stops_all_and_the_run_goes_on_in_one(tmp_path):
     long = [*EIGHT, "--ppo.num-steps", "19200", "--evaluation.number", "0"]
     start(tmp_path, 1, *long, "--name", "undisturbed")
@@ -216,6 +222,7 @@ def test_a_signal_to_one_stops_all_and_the_run_goes_on_in_one(tmp_path):
     assert lines(folder) == lines(folder.with_name("undisturbed"))
 
 
+@pytest.mark.slow
 def test_a_process_that_loses_the_other_says_so(tmp_path):
     endless = [*EIGHT, "--ppo.num-steps", "6400000", "--evaluation.number", "0"]
     processes = start_two(tmp_path, *endless)
@@ -229,6 +236,7 @@ def test_a_process_that_loses_the_other_says_so(tmp_path):
     assert "another is gone" in said.splitlines()[-1] and "--resume" in said
 
 
+@pytest.mark.slow
 def test_mistakes_end_all_processes(toy, tmp_path):
     said = both_end(start_two(toy.parent.parent, *EIGHT), USAGE)
     assert all("seed1 exists; use --resume to go on" in one for one in said)

@@ -164,6 +164,7 @@ def test_a_box_is_where_its_platform_is(case):
             np.testing.assert_allclose(far, 1.0 if on else -1.0, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["c", "jax"])
 def test_courses_differ_between_environments(engine):
     """The same state over ground in one environment, over a gap in the other: one falls."""

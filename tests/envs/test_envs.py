@@ -57,6 +57,7 @@ def trajectory(name, engine, height=0.0):
     return quick.jit(lambda s, a: jax.lax.scan(step, s, a)[1])(start, actions)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["c", "jax"])
 @pytest.mark.parametrize("name", BUILDERS)
 def test_contract(name, engine):

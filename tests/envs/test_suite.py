@@ -96,6 +96,7 @@ def compare(observe, dm, state):
     return np.abs(got.observation - expected).max(), abs(float(got.reward) - reward), float(reward)
 
 
+@pytest.mark.slow
 def test_observation_and_reward_are_dm_controls(pair, request):
     """`pytest -s` prints the table of the largest differences, observation and reward."""
     env, dm = pair
@@ -109,6 +110,7 @@ def test_observation_and_reward_are_dm_controls(pair, request):
     assert worst.max() < 1e-5
 
 
+@pytest.mark.slow
 def test_steps_are_dm_controls(pair):
     """From one state through 3 steps: the same time step, controls and substeps."""
     env, dm = pair
@@ -129,6 +131,7 @@ def test_steps_are_dm_controls(pair):
         np.testing.assert_allclose(state.reward, expected.reward, atol=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -154,6 +157,7 @@ def test_engines_agree(name):
     np.testing.assert_allclose(last[1][1], last[0][1], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_environments_keep_the_protocol(pair):
     check_env(pair[0], num_envs=2, num_steps=3)
 

@@ -132,6 +132,7 @@ def test_a_loop_reads_rows_of_few_numbers_by_column():
     np.testing.assert_allclose(got, jax.vmap(search)(x), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_physics_step_for_a_gpu_is_the_same_step():
     model = mujoco.MjModel.from_xml_string(ARM)
     p, c = (Physics(model, ("xpos", "cvel"), substeps=3, engine=engine) for engine in ("jax", "c"))

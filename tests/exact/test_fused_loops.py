@@ -173,6 +173,7 @@ def is_search(eqn):
     return len(eqn.outvars) > 8  # so much it carries, no other kernel writes
 
 
+@pytest.mark.slow
 def test_the_line_search_of_a_physics_step_is_one_kernel():
     p, args, kernels = physics_of_balls("pyramidal")
     assert any(map(is_search, kernels))

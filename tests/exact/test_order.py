@@ -29,6 +29,7 @@ def rough(x):
     return rows, looped, whiled, scanned, branch, segments, many, clipped, batched, tables
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fuse", [True, False])
 def test_rewritten_sums_are_the_same_sums(fuse):
     x = jax.random.uniform(jax.random.key(0), (8,))

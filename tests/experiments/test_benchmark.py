@@ -26,6 +26,7 @@ def small():
     )
 
 
+@pytest.mark.slow
 def test_only_the_parts_asked_for_are_compiled(small):
     assert [part.name for part in small.parts] == ["physics alone", "update"]
     assert [part.steps for part in small.parts] == [8, 8]
@@ -93,6 +94,7 @@ def test_compile_times_are_read_from_a_runs_output():
     assert start_up.compile_times("nothing yet") == {}
 
 
+@pytest.mark.slow
 def test_a_start_is_watched_to_its_first_update(tmp_path):
     toy = "tests/runs/toy_experiment.py"
     cold = start_up.start(toy, "c", [], tmp_path, "cold")

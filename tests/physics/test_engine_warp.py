@@ -29,6 +29,8 @@ import warp  # noqa: E402
 from purerl.physics import engine_warp, warp_buffers  # noqa: E402
 from purerl.runs.check_env import check_env  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 
 def same(first, second):
     """Asserts equal bits, whatever the leading axes."""

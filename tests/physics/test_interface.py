@@ -99,6 +99,7 @@ def trajectory(engine):
     return first, states, readings, controls
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cores", [{0}, {0, 7}])
 def test_c_has_a_thread_for_each_core_that_it_may_use_and_the_same_bits(monkeypatch, cores):
     """A job on a cluster may use a few of many, and MuJoCo by itself takes all."""
@@ -134,6 +135,7 @@ def test_c_is_mujoco_with_its_state_rounded_at_control_steps():
             np.testing.assert_array_equal(getattr(readings, name)[t, 1], expected, err_msg=name)
 
 
+@pytest.mark.slow
 def test_engines_agree_on_every_reading():
     a, b = trajectory("c"), trajectory("jax")
     assert a[2]._fields == b[2]._fields == READINGS
@@ -225,6 +227,7 @@ def test_a_silent_reset_of_mujoco_is_nan_on_c():
         assert np.isnan(leaf).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["c", "jax"])
 def test_changes_are_each_environments_own(engine):
     p = Physics(biped(), ("geom_xpos",), substeps=1, engine=engine)
@@ -370,6 +373,7 @@ def step_trace(model, rewritten, readings=("xpos", "subtree_com", "cvel")):
     return jax.make_jaxpr(p._engine.step if rewritten else p._engine.plain_step)(*arguments)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
 def test_no_scatter_sum_is_left_in_a_humanoid(jacobian):
     model = suite.load("humanoid", "run").physics.model.ptr
@@ -379,6 +383,7 @@ def test_no_scatter_sum_is_left_in_a_humanoid(jacobian):
     assert not exact.unordered_in(step_trace(model, rewritten=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("body", ["ant", "rodent"])
 def test_no_scatter_sum_is_left_in_the_bodies_of_dm_control(body):
     env = run.build(run.Options(body=body), engine="jax")
@@ -391,12 +396,14 @@ def test_no_scatter_sum_is_left_in_a_cartpole():
     assert not exact.unordered_in(step_trace(model, rewritten=True))
 
 
+@pytest.mark.slow
 def test_no_scatter_sum_is_left_with_forces_and_sensors():
     readings = ("cfrc_ext", "sensordata", "ten_length", "qfrc_actuator")
     assert exact.unordered_in(step_trace(biped(), False, readings))
     assert not exact.unordered_in(step_trace(biped(), True, readings))
 
 
+@pytest.mark.slow
 def test_rewriting_changes_no_number_of_mjx():
     p = physics("jax")
     state = jax.tree.map(lambda x: x[-1], trajectory("c")[1])

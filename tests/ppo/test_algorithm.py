@@ -228,6 +228,7 @@ def test_segments_are_estimated_from_the_values_of_now(length):
         np.testing.assert_allclose(target[:, columns], expected + part.value, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_segments_stay_whole_and_are_renewed_before_each_gradient_step(monkeypatch):
     config = dataclasses.replace(CONFIG, segment_length=4)
     env, network, state = setup()
@@ -278,6 +279,7 @@ class BadStarts(Walk):
         return self.state(x, jnp.zeros(()), x)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recurrent", [False, True])
 def test_a_start_that_is_no_number_costs_its_own_step_alone(recurrent):
     env, network, state = setup(env=BadStarts(), recurrent=recurrent)
@@ -343,6 +345,7 @@ def altered(network, change):
     return network._replace(init=init)
 
 
+@pytest.mark.slow
 def test_parameters_of_half_precision_stay_so():
     half = altered(
         NETWORKS[False],
@@ -379,6 +382,7 @@ def test_weights_have_a_sign(name, value):
     assert name in unmade(lambda: dataclasses.replace(CONFIG, **{name: value}))
 
 
+@pytest.mark.slow
 def test_a_memory_may_hold_integers():
     def apply(params, observation, carry):
         output, memory = NETWORKS[True].apply(params, observation, carry["memory"])

@@ -100,6 +100,7 @@ BREAKS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROBES)
 def test_probe_fails_when_its_part_is_broken(name, monkeypatch):
     module, function, broken = BREAKS[name]
@@ -125,12 +126,14 @@ def memory_error(build, options):
     return float(-metrics["episode_return"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cell", ["gru", "lstm"])
 def test_recurrent_network_remembers_the_cue(cell):
     options = networks.RecurrentOptions(cell=cell, hidden=32, encoder=(32,), value_hidden=(32,))
     assert memory_error(networks.recurrent, options) < 0.1
 
 
+@pytest.mark.slow
 def test_feed_forward_network_cannot_remember_the_cue():
     # The best it can do is action 0, for a squared error of 0.25.
     assert memory_error(networks.mlp, SMALL) > 0.22

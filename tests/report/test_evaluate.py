@@ -46,6 +46,7 @@ def test_it_reports_every_metric_under_the_runs_own_settings(trained, tmp_path, 
     assert "N = 6 episodes" in said and "reward_mean" in said and "std" in said
 
 
+@pytest.mark.slow
 def test_a_second_process_finds_its_program_compiled(trained, tmp_path):
     """The event is JAX's own, of a program that it has loaded from its cache."""
     watch = (
@@ -82,6 +83,7 @@ def test_a_checkpoint_can_be_chosen(trained, tmp_path, capsys):
     assert f"Valid: latest, best, {updates[0]}" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_policy_is_judged_on_an_engine_whose_states_have_other_leaves(tmp_path):
     # As a run of engine warp, which counts overflows, is on a laptop.
     text = TOY.read_text().replace("return Probe(", "return engine_probe(engine, ")

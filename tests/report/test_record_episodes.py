@@ -72,6 +72,7 @@ def test_its_episodes_begin_as_those_of_an_evaluation(lstm, tmp_path):
     np.testing.assert_allclose(arrays["reward"].sum(axis=1), judged, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_layer_is_computed_from_the_observation_beside_it(mlp):
     """Recomputed from the checkpoint's weights, from the observation to the action."""
     _, arrays, state = mlp

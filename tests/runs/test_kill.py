@@ -8,6 +8,7 @@ from tests.runs.test_run import TOY
 LONG = [str(TOY), "--ppo.num-steps", "4800", "--checkpoints", "15"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "kills"),
     [(LONG, 2), ([*LONG, "--num-seeds", "3", "--keep", "1"], 2)],

@@ -65,6 +65,7 @@ def judge(place: Path) -> int:
     return evaluate.main([str(place / "runs" / "mine" / "seed1"), "--episodes", "2"])
 
 
+@pytest.mark.slow
 def test_what_stands_beside_the_file_is_found_from_the_run(place, capsys):
     assert train(place) == errors.SUCCESS
     capsys.readouterr()
@@ -188,6 +189,7 @@ def test_rewards_that_are_no_numbers_end_the_run(place, capsys):
     assert "Traceback" not in said
 
 
+@pytest.mark.slow
 def test_lost_episodes_are_told(place, capsys):
     half = "jnp.where(state.observation[0] > 0.0, jnp.nan, state.reward)"
     (place / "mine.py").write_text(MINE.replace("state.reward * HABIT", half))
@@ -196,6 +198,7 @@ def test_lost_episodes_are_told(place, capsys):
     assert " episodes lost (NaN, or absurd)" in said and "% lost" in said
 
 
+@pytest.mark.slow
 def test_a_run_whose_checkpoints_are_gone_says_that_it_begins_anew(place, capsys):
     assert train(place) == errors.SUCCESS
     shutil.rmtree(place / "runs" / "mine" / "seed1" / "checkpoints")

@@ -210,6 +210,7 @@ def test_a_run_killed_in_its_first_save_begins_as_it_did(whole, tmp_path, stop_a
     assert lines(tmp_path) == lines(whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_shards", [1, 2])
 def test_a_beginning_has_the_same_bits_however_it_is_compiled(num_shards):
     chosen = find("cartpole_swingup")
@@ -224,6 +225,7 @@ def test_a_beginning_has_the_same_bits_however_it_is_compiled(num_shards):
     assert len(digests) == 1
 
 
+@pytest.mark.slow
 def test_with_xla_on_one_thread_the_cores_do_not_matter(tmp_path):
     """MuJoCo's threads change no bits; the size of XLA's own pool does, for this ant."""
     words = ["ant_run", "--engine", "c", "--ppo.num-envs", "64", "--ppo.num-steps", "4096"]
@@ -250,6 +252,7 @@ def undisturbed(tmp_path_factory) -> list[dict]:
     return lines(place)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_a_killed_process_resumes_to_the_same_bits(undisturbed, tmp_path, number):
     process = spawn(tmp_path, *LONG)
@@ -315,6 +318,7 @@ def small_disk(tmp_path):
     subprocess.run(["umount", str(place)], check=True)
 
 
+@pytest.mark.slow
 def test_a_truly_full_disk_loses_nothing(whole, tmp_path, small_disk):
     runs, enlarge = small_disk
     words = ["--checkpoints", "12", "--keep", "12"]

@@ -55,6 +55,7 @@ def test_a_mapped_seed_that_fails_is_told_before_the_next_one(tmp_path, monkeypa
     assert capsys.readouterr().err.splitlines() == ["purerl: It diverged.", "purerl: Enough."]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("experiment", "words"),
     [(str(TOY), []), (str(ROOT / "experiments" / "cartpole_swingup.py"), CARTPOLE)],
@@ -76,6 +77,7 @@ def test_mapped_seeds_are_single_runs_bit_for_bit(tmp_path, experiment, words):
     assert (files[0] / "config.json").read_text() == (files[1] / "config.json").read_text()
 
 
+@pytest.mark.slow
 def test_a_mapped_seed_resumes_as_a_single_run(tmp_path, stop_after):
     words = [*THREE, "--seeds-by", "map"]
     stop_after(27)  # in the second seed
@@ -90,6 +92,7 @@ def test_a_mapped_seed_resumes_as_a_single_run(tmp_path, stop_after):
     assert lines(tmp_path, "seed3")[-1]["update"] == 12
 
 
+@pytest.mark.slow
 def test_vmapped_seeds_learn_as_single_runs_but_for_rounding(vmapped, tmp_path):
     assert start(tmp_path, "--seed", "2", "--checkpoints", "4") == SUCCESS
     many, single = lines(vmapped, "seed2"), lines(tmp_path, "seed2")
