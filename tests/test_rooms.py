@@ -94,6 +94,13 @@ def test_a_room_says_what_belongs_there(room):
     assert re.search(r"\bRead:? ", said), "where a reader starts"
 
 
+def test_contributors_read_the_same_table():
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    for room, below in MAY_IMPORT.items():
+        (cell,) = re.findall(rf"^\| `{room}` \| .* \| ([^|]*) \|$", text, re.MULTILINE)
+        assert set(re.findall(r"`(\w+)`", cell)) == below, room
+
+
 def test_no_circles():
     done, path = set(), []
 
