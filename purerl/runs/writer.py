@@ -11,7 +11,7 @@ from typing import Any
 
 from purerl.core.errors import RunError, one_line
 from purerl.runs import checkpoint, checkpoint_folder, state_arrays
-from purerl.runs.loggers import MetricsFile, Record, Say
+from purerl.runs.loggers import BackgroundLogger, MetricsFile, Record, Say
 
 
 class RunWriter:
@@ -43,7 +43,7 @@ class RunWriter:
         checkpoint_folder.clean(self.checkpoints)
         self.metrics = MetricsFile(folder / "metrics.jsonl", offset)
         self.keep, self.say = keep, say
-        self.loggers: list[Any] = []  # BackgroundLogger or RunVideo
+        self.loggers: list[BackgroundLogger] = []
         self.worker, self.together = worker, together
         self.last: Future[None] | None = None
         self.saving: Future[None] | None = None

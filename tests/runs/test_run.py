@@ -427,7 +427,7 @@ def test_a_read_only_folder_is_told_and_unharmed(whole, unprivileged, capsys):
     before = [f.read_bytes() for f in sorted(place.rglob("*")) if f.is_file()]
     lose_privileges()
     said = refused(capsys, start(place, "--resume"))
-    assert f"{folder(place)} cannot be written: Permission denied" in said
+    assert f"{folder(place)}/.lock cannot be written: Permission denied" in said
     assert "cannot be written" in refused(capsys, start(place, "--name", "new"))
     assert [f.read_bytes() for f in sorted(place.rglob("*")) if f.is_file()] == before
 
