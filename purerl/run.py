@@ -27,10 +27,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(help_page())
+        print(_help_page())
         return 0 if arguments else USAGE
     try:
-        command(arguments)
+        _command(arguments)
     except (UserError, RunError, StoppedError) as error:
         code = tell(error)
         if isinstance(error, StoppedError):
@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def help_page() -> str:
+def _help_page() -> str:
     """Returns the page of `python -m purerl.run --help`, without importing JAX."""
     lines = [str(__doc__), "Experiments:"]
     named = experiment.available()
@@ -50,7 +50,7 @@ def help_page() -> str:
     return "\n".join(lines if named else [*lines, "  none in experiments/"])
 
 
-def command(arguments: Sequence[str]) -> None:
+def _command(arguments: Sequence[str]) -> None:
     """Parses, trains, and with --video shows the policy of the first seed."""
     from purerl import render
     from purerl.report.renderer import choose_gl
@@ -67,22 +67,17 @@ def command(arguments: Sequence[str]) -> None:
     prog = f"python -m purerl.run {arguments[0]}"
     chosen, options = from_command_line(source, arguments[1:], prog)
     if options.video:  # before mujoco is imported, which looks for OpenGL itself
-        attempt(choose_gl)
+        _attempt(choose_gl)
     folders = training.train_runs(source, chosen, options, os._exit)
     if options.video:
         from purerl.devices.processes import is_first
 
         if is_first():
-            attempt(render.command, render.Options(folders[0]))
+            _attempt(render.command, render.Options(folders[0]))
 
 
-def attempt(part: Callable[..., Any], *arguments: Any) -> None:
-    """Does a part of a video's work; a failure is one line, and changes neither run nor exit code.
-
-    Args:
-      part: what to call.
-      arguments: of `part`.
-    """
+def _attempt(part: Callable[..., Any], *arguments: Any) -> None:
+    """Calls a part of making a video; a failure is one line, and changes no exit code."""
     try:
         part(*arguments)
     except Exception as error:

@@ -15,7 +15,13 @@ def check_network(network: Network, observation: PyTree, action_size: int) -> No
       action_size: A.
     """
     params, carry = jax.eval_shape(network.init, jax.random.key(0))
-    check_parameters(params)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            raise ValueError(
+                f"The network's parameter {jax.tree_util.keystr(path)} is {leaf.dtype}: parameters "
+                "are trained, so they are floating-point numbers. Keep constants in the closure of "
+                "`apply`."
+            )
     batch = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct((2, *x.shape), x.dtype), (observation, carry)
     )
@@ -35,14 +41,3 @@ def check_network(network: Network, observation: PyTree, action_size: int) -> No
             f"The network's memory goes in as {kinds[0]} and comes back as {kinds[1]}, for 2 "
             "environments; `apply` must return it as it was given, and `init` one environment's."
         )
-
-
-def check_parameters(params: PyTree) -> None:
-    """Raises ValueError for a parameter that no gradient can change."""
-    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
-        if not jnp.issubdtype(leaf.dtype, jnp.floating):
-            raise ValueError(
-                f"The network's parameter {jax.tree_util.keystr(path)} is {leaf.dtype}: parameters "
-                "are trained, so they are floating-point numbers. Keep constants in the closure of "
-                "`apply`."
-            )

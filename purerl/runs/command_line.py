@@ -56,13 +56,10 @@ def from_command_line(
     """
     values = experiment.settings(source.experiment)
     kinds = {f.name: f.type for f in dataclasses.fields(Experiment)}
-    fields = [
-        (name, type(value) if dataclasses.is_dataclass(value) else kinds[name],
-         dataclasses.field(kw_only=True))
-        for name, value in values.items()
-    ]  # fmt: skip
+    kinds |= {name: type(v) for name, v in values.items() if dataclasses.is_dataclass(v)}
     # A class made for this experiment: its settings have the types of their values, which is all
     # that the command line needs to know, so an environment's options need no registration.
+    fields = [(name, kinds[name], dataclasses.field(kw_only=True)) for name in values]
     both = dataclasses.make_dataclass("Settings", fields, bases=(Options,), frozen=True)
     both.__doc__ = experiment.summary(source.path) or f"Trains {source.name}."
     parsed = parse(both, arguments, prog, both(**values), config)
@@ -81,7 +78,7 @@ def from_settings(
       settings: "ppo.num_envs" -> value.
       options: "num_seeds" -> value.
     """
-    words = [word for pair in (dict(settings) | dict(options)).items() for word in _words(*pair)]
+    words = [word for pair in {**settings, **options}.items() for word in _words(*pair)]
     return from_command_line(source, words, f"python -m purerl.run {source.name}", WORDS)
 
 
@@ -110,10 +107,10 @@ def parse(
     except SystemExit as error:
         if not error.code:
             raise
-        raise UserError(f"{one_line(said.getvalue())} All options: {prog} --help") from error
+        raise UserError(f"{_one_line(said.getvalue())} All options: {prog} --help") from error
 
 
-def one_line(text: str) -> str:
+def _one_line(text: str) -> str:
     """Returns tyro's framed, coloured message as one line: what is wrong, and the nearest fix."""
     text = re.sub(r"\x1b\[[0-9;]*m", "", text)
     plain = " ".join(re.sub(r"[─-╿]", " ", text).split())

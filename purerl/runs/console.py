@@ -69,29 +69,38 @@ def size(tree: PyTree) -> int:
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
-class Lines:
+class _Lines:
     """Progress as plain lines, for logs and pipes."""
 
     def __init__(self, updates: int) -> None:
-        """Shows how far of `updates` a run is."""
         self.updates = updates
         self.shown = 0.0  # when, by the monotonic clock [s]
 
     def say(self, line: str) -> None:
-        """Prints a line."""
         print(line, flush=True)
 
     def show(self, record: Record, seconds_left: float, steps_per_second: float) -> None:
         """Prints a line for a chunk, unless one has just been printed."""
-        now = time.monotonic()
-        last = record["update"] >= self.updates
-        if now - self.shown < SECONDS_BETWEEN_LINES and not last:
-            return
-        self.shown = now
-        self.say(
-            f"update {record['update']}/{self.updates}  "
-            + figures(record, seconds_left, steps_per_second)
-        )
+        now, update = time.monotonic(), record["update"]
+        if now - self.shown >= SECONDS_BETWEEN_LINES or update >= self.updates:
+            self.shown = now
+            text = figures(record, seconds_left, steps_per_second)
+            self.say(f"update {update}/{self.updates}  {text}")
+
+
+class _Bar:
+    """Progress as a live bar, for a terminal; `bar` is a `rich` display."""
+
+    def __init__(self, updates: int, bar: Any) -> None:
+        self.bar = bar
+        self.task = bar.add_task("", total=updates)
+
+    def say(self, line: str) -> None:
+        self.bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    def show(self, record: Record, seconds_left: float, steps_per_second: float) -> None:
+        text = figures(record, seconds_left, steps_per_second)
+        self.bar.update(self.task, completed=record["update"], description=text)
 
 
 def figures(record: Record, seconds_left: float, steps_per_second: float) -> str:
@@ -106,32 +115,17 @@ def figures(record: Record, seconds_left: float, steps_per_second: float) -> str
     return f"steps {record['steps']:,}  return {shown}{warning}  {rate}  left {left}"
 
 
-class Bar:
-    """Progress as a live bar, for a terminal."""
-
-    def __init__(self, updates: int, bar: Any) -> None:
-        """Drives a `rich` progress display."""
-        self.bar = bar
-        self.task = bar.add_task("", total=updates)
-
-    def say(self, line: str) -> None:
-        """Prints a line above the bar."""
-        self.bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
-
-    def show(self, record: Record, seconds_left: float, steps_per_second: float) -> None:
-        """Moves the bar."""
-        text = figures(record, seconds_left, steps_per_second)
-        self.bar.update(self.task, completed=record["update"], description=text)
-
-
 @contextmanager
-def progress(updates: int) -> Iterator[Lines | Bar]:
-    """Yields a live bar where standard output is a terminal, plain lines elsewhere."""
+def progress(updates: int) -> Iterator[_Lines | _Bar]:
+    """Yields what shows progress: a live bar on a terminal, plain lines elsewhere.
+
+    It has `say(line)`, and `show(record, seconds_left, steps_per_second)` for each chunk.
+    """
     if not sys.stdout.isatty():
-        yield Lines(updates)
+        yield _Lines(updates)
         return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
     columns = (BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"))
     with Progress(*columns) as bar:
-        yield Bar(updates, bar)
+        yield _Bar(updates, bar)

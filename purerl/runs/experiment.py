@@ -7,7 +7,6 @@ import ast
 import contextlib
 import dataclasses
 import enum
-import importlib
 import importlib.util
 import re
 import sys
@@ -15,7 +14,6 @@ import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Annotated, Any, Literal, NamedTuple
 
 import tyro
@@ -107,14 +105,16 @@ def find_source(name: str) -> Source:
     """Loads an experiment by name, path or module; see `find`."""
     named = available()
     if name.endswith(".py") or "/" in name:
-        path = Path(name)
-        if not path.is_file():
+        if not Path(name).is_file():
             raise UserError(f"There is no experiment file {name}.")
-        return load(path)
+        return load(Path(name))
     if name in named:
         return load(named[name])
-    if "." in name:
-        return _from_module(name)
+    spec = None
+    with contextlib.suppress(ImportError, ValueError):
+        spec = importlib.util.find_spec(name) if "." in name else None
+    if spec is not None and str(spec.origin).endswith(".py"):
+        return load(Path(str(spec.origin)))
     places = f" in {' or '.join(map(str, _folders())) or 'sight'}"
     raise UserError(unknown_name("experiment", name, named, places))
 
@@ -137,8 +137,21 @@ def load(path: Path, name: str = "", copy_of: Path | None = None) -> Source:
     sys.modules[module_name] = module  # dataclasses and help texts look their module up
     module.__file__ = str(place)
     with _mistakes(str(path), place):
+        nodes = list(ast.walk(ast.parse(path.read_text(), str(path))))
+    if any(isinstance(node, ast.ImportFrom) and node.level for node in nodes):
+        raise UserError(
+            f"{path} imports relatively (from . import ...), and a run keeps a copy of the file "
+            "that has to work alone: import by the full name."
+        )
+    with _mistakes(str(path), place):
         spec.loader.exec_module(module)
-    return _checked(module, name or path.stem, path)
+    found = getattr(module, "experiment", None)
+    if not isinstance(found, Experiment):
+        raise UserError(f"{path} defines no `experiment = Experiment(...)` (it is {found!r}).")
+    for field in ("env", "network", "ppo", "evaluation"):
+        if not _has_settings(value := getattr(found, field)):
+            raise UserError(f"{path}: {field} is {value!r}; it must be a frozen dataclass's value.")
+    return Source(found, name or path.stem, path)
 
 
 def _module_name(path: Path) -> str:
@@ -173,36 +186,6 @@ def _mistakes(file: str, place: Path) -> Iterator[None]:
         elif missing and (beside.is_dir() or beside.with_suffix(".py").exists()):
             hint = f"; it stands beside the file: set PYTHONPATH={place.parent}"
         raise UserError(f"{file}{where}: {one_line(error)}{hint}") from error
-
-
-def _from_module(name: str) -> Source:
-    try:
-        spec = importlib.util.find_spec(name)
-    except (ImportError, ValueError):
-        spec = None
-    if spec is None or spec.origin is None:
-        raise UserError(unknown_name("experiment", name, available()))
-    path = Path(spec.origin)
-    with _mistakes(spec.origin, path):
-        module = importlib.import_module(name)
-        nodes = list(ast.walk(ast.parse(path.read_text())))
-    if any(isinstance(node, ast.ImportFrom) and node.level for node in nodes):
-        raise UserError(
-            f"{path} imports relatively (from . import ...), and a run keeps a copy of the file "
-            "that has to work alone: import by the full name."
-        )
-    return _checked(module, name.rpartition(".")[2], path)
-
-
-def _checked(module: ModuleType, name: str, path: Path) -> Source:
-    found = getattr(module, "experiment", None)
-    if not isinstance(found, Experiment):
-        raise UserError(f"{path} defines no `experiment = Experiment(...)` (it is {found!r}).")
-    for field in ("env", "network", "ppo", "evaluation"):
-        value = getattr(found, field)
-        if not _has_settings(value):
-            raise UserError(f"{path}: {field} is {value!r}; it must be a frozen dataclass's value.")
-    return Source(found, name, path)
 
 
 # --- settings as JSON ---

@@ -171,12 +171,6 @@ def _noted(folder: Path, old: dict[str, Any], found: list[str]) -> dict[str, Any
     return known | {"allowed_changes": [*old.get("allowed_changes", []), entry]}
 
 
-def amend(folder: Path, facts: dict[str, Any]) -> None:
-    """Adds facts to manifest.json."""
-    path = folder / "manifest.json"
-    write_json(path, read_json(path) | facts)
-
-
 # --- reading back ---
 
 

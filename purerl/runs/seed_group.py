@@ -48,9 +48,14 @@ def train_together(job: Job, folders: list[Path], seeds: list[int]) -> None:
         if processes.is_first():
             progress = stack.enter_context(console.progress(plan.updates))
         say, saved = progress.say, list[checkpoint.Saved]()
+        places = [folder / "checkpoints" for folder in folders]
 
         def find() -> dict[str, Any]:
-            saved.extend(_find_saved(folders, job, say))
+            saved.extend(checkpoint.newest(places, job.abstract, say))
+            if not saved:
+                checkpoint_folder.check_none_lost(places)
+                if job.options.resume:
+                    say(f"There is no checkpoint in {places[0]}: it begins anew.")
             known = saved[0].meta if saved else {"wall_s": 0.0, "update": 0}
             return {name: known[name] for name in ("wall_s", "update")} | {"found": bool(saved)}
 
@@ -79,17 +84,6 @@ def train_together(job: Job, folders: list[Path], seeds: list[int]) -> None:
         for folder, writer in zip(folders, writers, strict=True):
             of = f" of {folder.name}" if job.options.num_seeds > 1 else ""
             say(f"Done: {plan.steps:,} steps{of}. Digest {writer.digest}")
-
-
-def _find_saved(folders: list[Path], job: Job, say: Say) -> list[checkpoint.Saved]:
-    """Returns the newest checkpoint that all runs have, one each; [] if there is none yet."""
-    places = [folder / "checkpoints" for folder in folders]
-    saved = checkpoint.newest(places, job.abstract, say)
-    if not saved:
-        checkpoint_folder.check_none_lost(places)
-        if job.options.resume:
-            say(f"There is no checkpoint in {places[0]}: it begins anew.")
-    return saved
 
 
 def _first_state(

@@ -26,7 +26,7 @@ from purerl.ppo.config import Config
 from purerl.ppo.learner import is_recurrent
 from purerl.runs import build_experiment, checkpoint_folder, console, loop, manifest, run_folder
 from purerl.runs.experiment import Experiment, Source
-from purerl.runs.files import read_json
+from purerl.runs.files import read_json, write_json
 from purerl.runs.loggers import check_loggers
 from purerl.runs.options import Options
 from purerl.runs.seed_group import Job, train_together
@@ -109,9 +109,9 @@ def _tell_unordered(
     folders: Iterable[Path], engine: str, kernels: str, unordered: list[str]
 ) -> None:
     """Adds to manifest.json, and prints, what is known only when programs are compiled."""
-    exactness = manifest.exactness(engine, kernels, unordered)
     for folder in folders:
-        run_folder.amend(folder, exactness)
+        path = folder / "manifest.json"
+        write_json(path, read_json(path) | manifest.exactness(engine, kernels, unordered))
     for place in unordered:
         print(f"Not bit-exact: nothing fixes the order of the sum {place}", flush=True)
 

@@ -46,8 +46,9 @@ def unflatten(leaves: Leaves, abstract: PyTree) -> PyTree:
         if is_key(like) and not like.size:
             raise ValueError(f"A zero-size array of keys (shape {like.shape}) cannot be rebuilt.")
         # A real copy again: a buffer shared with numpy must not be donated.
-        array = leaves[path] if like.size else np.zeros(like.shape, like.dtype)
-        array = jnp.array(array, copy=True)
+        array = jnp.array(
+            leaves[path] if like.size else np.zeros(like.shape, like.dtype), copy=True
+        )
         out.append(jax.random.wrap_key_data(array, impl=_impl(like)) if is_key(like) else array)
     return jax.tree.unflatten(jax.tree.structure(abstract), out)
 
