@@ -27,8 +27,7 @@ A network:
 Other:
   exact: a package: programs of MJX with their sums in a fixed order, without the trainer.
   Array, PyTree: for type annotations.
-  UserError, RunError, StoppedError: a mistake of the caller; a run that cannot go on; one that was
-    asked to stop.
+  UserError, RunError, StoppedError: a wrong call; a run that cannot go on; one that was stopped.
 
 A name is imported when it is first used: `import purerl` does not start JAX.
 """

@@ -64,10 +64,9 @@ def _orbax() -> Any:
 
 
 def _print_unraisable(raised: Any) -> None:
-    """Prints what could not be raised, but for the writes that a failed save leaves under way.
+    """Prints what could not be raised, but not what a failed save's unfinished writes end with.
 
-    They end one by one in threads of the storage library, each with the same complaint; the save
-    has been reported as failed by then.
+    They end one by one, in threads of the storage library, after the failure has been reported.
     """
     if str(raised.exc_value) != "Event loop is closed":
         sys.__unraisablehook__(raised)

@@ -57,8 +57,7 @@ def build(chosen: Experiment) -> Setup:
 def blame(env: Env) -> Iterator[None]:
     """Makes one line of programs that cannot be traced because the environment breaks a rule.
 
-    Only then are the rules looked at: that traces a step of the environment, which may take
-    seconds.
+    The rules are looked at only then: to trace a step of the environment may take seconds.
     """
     try:
         yield

@@ -28,7 +28,10 @@ def check_env(env: Env, num_envs: int = 4, num_steps: int = 4) -> None:
     state = reset(_again(keys))
     _check_bits("equal keys", state, reset(keys), "reset must be a function of its key alone")
     _check_differs(state)
-    actions = _actions(num_steps, num_envs, env.action_size)
+    shape = (num_envs, env.action_size)
+    corners = [jnp.full((1, *shape), number) for number in (-1.0, 0.0, 1.0)]
+    noise = jax.random.uniform(jax.random.key(1), (num_steps, *shape), minval=-1.0, maxval=1.0)
+    actions = jnp.concatenate([*corners, noise])
 
     @jax.jit
     def rollout(state: State, actions: Array) -> tuple[State, State]:
@@ -141,14 +144,6 @@ def _check_same(reset: dict[str, str], step: dict[str, str]) -> None:
 def _again(tree: PyTree) -> PyTree:
     """Copies a tree for a second use of its keys, which JAX's key-reuse checking would refuse."""
     return jax.tree.map(lambda x: jax.random.clone(x) if is_key(x) else x, tree)
-
-
-def _actions(num_steps: int, num_envs: int, size: int) -> Array:
-    """Returns actions [3 + T, B, A]: all -1, all 0, all 1, then random ones."""
-    corners = jnp.broadcast_to(jnp.array([-1.0, 0.0, 1.0])[:, None, None], (3, num_envs, size))
-    shape = (num_steps, num_envs, size)
-    noise = jax.random.uniform(jax.random.key(1), shape, minval=-1.0, maxval=1.0)
-    return jnp.concatenate([corners, noise])
 
 
 def _check_finite(when: str, state: PyTree) -> None:

@@ -67,17 +67,15 @@ def load(path: Path, abstract: PyTree) -> Saved:
     """
     meta = load_meta(path)
     _check_fits(path, meta, abstract)
-    leaves = {
-        key: np.zeros(about["shape"], jnp.dtype(about["dtype"]))
-        for key, about in meta["leaves"].items()
-    }
+    stored = meta["leaves"].items()
+    leaves = {key: np.zeros(about["shape"], jnp.dtype(about["dtype"])) for key, about in stored}
     try:
         leaves |= array_files.read(path, {key: x for key, x in leaves.items() if x.size})
     except (PermissionError, MemoryError) as error:  # no damage: it shall not be put aside
         raise UserError(f"The checkpoint {path} cannot be read: {one_line(error)}") from error
     except Exception as error:  # Orbax raises many kinds for broken files, none of them its own
         raise DamagedError(f"its arrays cannot be read ({type(error).__name__})") from error
-    for key, about in meta["leaves"].items():
+    for key, about in stored:
         if _describe(leaves[key]) != about:
             raise DamagedError(f"leaf {key} is not what was written (sha256 differs)")
     if digest_leaves(leaves) != meta["digest"]:
@@ -94,8 +92,7 @@ def newest(
       folders: the checkpoints of a run, or of each of the seeds that train together.
       abstract: shapes of one seed's state.
       say: told of each damaged checkpoint.
-      rename: whether to rename damaged ones to `damaged-<n>-<update>`; False where another process
-        may be writing the run.
+      rename: whether to rename damaged ones; False where another process may write the run.
 
     Returns:
       One checkpoint for each folder; [] if there is no such update.

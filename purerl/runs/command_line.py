@@ -71,7 +71,7 @@ def from_command_line(
 def from_settings(
     source: Source, settings: Mapping[str, Any], options: Mapping[str, Any]
 ) -> tuple[Experiment, Options]:
-    """Returns the same as `from_command_line`, from Python values, checked in the same way.
+    """Returns the same as `from_command_line`, checked in the same way, from Python values.
 
     Args:
       source: the experiment.
@@ -99,8 +99,8 @@ def parse(
     Raises:
       UserError: there is no such option (the message has the nearest one), or a value is wrong.
     """
-    extra = {} if default is None else {"default": default}
     said = io.StringIO()
+    extra = {} if default is None else {"default": default}
     try:
         with contextlib.redirect_stderr(said):
             return tyro.cli(kind, args=list(arguments), prog=prog, config=config, **extra)

@@ -260,9 +260,8 @@ def _join(path: str, name: str) -> str:
 def _check_names(names: list[str], values: Any, path: str) -> None:
     if not isinstance(values, dict):
         raise UserError(f"The settings of {path} are {values!r}; they must be {{name: value}}.")
-    for name in sorted({*names, *values}):
-        if name not in values:
+    for name in sorted(set(names).symmetric_difference(values)):
+        if name in names:
             raise UserError(f"config.json lacks {_join(path, name)}, which the experiment has.")
-        if name not in names:
-            valid = [_join(path, n) for n in names]
-            raise UserError(unknown_name("setting", _join(path, name), valid))
+        valid = [_join(path, n) for n in names]
+        raise UserError(unknown_name("setting", _join(path, name), valid))

@@ -40,6 +40,11 @@ def load(folder: Path | str, checkpoint: str = "latest", engine: str = "") -> "R
     return Run(folder, str(checkpoint), engine)
 
 
+def _saved_as(name: str, doc: str) -> property:
+    """Returns a property: what the checkpoint says of itself by that name."""
+    return property(lambda self: self.restored.saved.meta[name], doc=doc)
+
+
 @dataclass(frozen=True)
 class Run:
     """A run read back; what it holds is built when it is first asked for."""
@@ -72,15 +77,9 @@ class Run:
         attrgetter("restored.saved.state"),
         doc="The checkpoint's TrainState, without environments, episodes and optimizer.",
     )
-    update = property(lambda self: self.restored.saved.meta["update"], doc="Updates done.")
-    steps = property(
-        lambda self: self.restored.saved.meta["steps"],
-        doc="Control steps taken, all environments together.",
-    )
-    digest = property(
-        lambda self: self.restored.saved.meta["digest"],
-        doc="The sha256 of the whole state that was saved.",
-    )
+    update = _saved_as("update", "Updates done.")
+    steps = _saved_as("steps", "Control steps taken, all environments together.")
+    digest = _saved_as("digest", "The sha256 of the whole state that was saved.")
 
     def metrics(self) -> dict[str, list[Any]]:
         """Returns metrics.jsonl as columns, None where a line lacks one; JAX is not needed.
@@ -127,9 +126,7 @@ class Run:
         found = jax.device_get(jax.jit(judge)(self.state, key))
         return {
             "run": str(self.folder),
-            "update": self.update,
-            "steps": self.steps,
-            "digest": self.digest,
+            **{name: getattr(self, name) for name in ("update", "steps", "digest")},
             "engine": engine,
             "seed": seed,
             "policy": "stochastic" if stochastic else "deterministic",

@@ -1,8 +1,7 @@
 """What a run tells: metrics.jsonl, which is part of the run, and loggers, which are not.
 
 metrics.jsonl is exact: it holds the same lines whether the run was resumed or not. TensorBoard and
-W&B have threads of their own. Training never waits for them: a logger that raises an error, or
-cannot keep up, is dropped with one message.
+W&B have threads of their own, for which training never waits.
 """
 
 import importlib.util
@@ -22,7 +21,7 @@ Record = dict[str, Any]
 Say = Callable[[str], None]
 
 MAX_SKIPPED_IN_A_ROW = 10  # minibatches; a run that skips so many cannot go on
-COUNTS = ("episodes", "nonfinite_resets", "replayed_resets", "reused_resets", "skipped_minibatches")
+COUNTS = ("episodes", "nonfinite_resets", "replayed_resets", "skipped_minibatches")
 
 
 def summarize(window: Sequence[Mapping[str, Any]]) -> Record:
@@ -139,31 +138,25 @@ class BackgroundLogger:
             self.say(f"The {self.name} logger is dropped: {reason}. Training goes on.")
 
 
-class TensorBoardSink:
-    """Writes scalars for TensorBoard under the run's folder."""
+class _TensorBoardSink:
+    """Writes scalars for TensorBoard; what an earlier life wrote after `update` is hidden."""
 
     def __init__(self, folder: Path, update: int) -> None:
-        """Opens a writer that hides what an earlier life of the run wrote after `update`."""
         from tensorboardX import SummaryWriter
 
         self.writer = SummaryWriter(str(folder / "tensorboard"), purge_step=update + 1)
+        self.close = self.writer.close
 
     def log(self, record: Record) -> None:
-        """Writes every number of a record, at its update."""
         for name, value in record.items():
             if isinstance(value, float) and math.isfinite(value):
                 self.writer.add_scalar(name, value, record["update"])
 
-    def close(self) -> None:
-        """Flushes and closes."""
-        self.writer.close()
 
-
-class WandbSink:
+class _WandbSink:
     """Sends records to Weights & Biases; a resumed run goes on under the same id."""
 
     def __init__(self, folder: Path, mode: Any, project: str) -> None:
-        """Starts or continues the W&B run; its files go under the run's folder."""
         import wandb
 
         self.run = wandb.init(
@@ -199,8 +192,8 @@ def open_loggers(options: Options, folder: Path, update: int, say: Say) -> list[
     """
     found = []
     if options.tensorboard:
-        found.append(BackgroundLogger("TensorBoard", lambda: TensorBoardSink(folder, update), say))
+        found.append(BackgroundLogger("TensorBoard", lambda: _TensorBoardSink(folder, update), say))
     if options.wandb != "off":
         mode, project = options.wandb, options.wandb_project
-        found.append(BackgroundLogger("W&B", lambda: WandbSink(folder, mode, project), say))
+        found.append(BackgroundLogger("W&B", lambda: _WandbSink(folder, mode, project), say))
     return found

@@ -49,8 +49,7 @@ def lock(folder: Path) -> IO[str]:
             "another --name."
         ) from error
     handle.truncate(0)
-    handle.write(str(os.getpid()))
-    handle.flush()
+    print(os.getpid(), file=handle, flush=True)
     return handle
 
 
@@ -163,7 +162,7 @@ def _noted(folder: Path, old: dict[str, Any], found: list[str]) -> dict[str, Any
 
     A copy under another name gets a run_id of its own: loggers must not take it for the first run.
     """
-    known = {"run_id": old.get("run_id", ""), "name": old.get("name", folder.name)}
+    known = {name: old[name] for name in ("run_id", "name")}
     after = max(checkpoint_folder.updates(folder / "checkpoints"), default=0)
     entry: dict[str, Any] = {"after_update": after, "changes": found}
     if known["name"] != folder.name:
@@ -190,7 +189,7 @@ def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> Rest
     check_is_run(folder)
     config = read_json(folder / "config.json")
     begun = read_json(folder / "manifest.json")
-    original = Path(begun["experiment_file"]) if "experiment_file" in begun else None
+    original = Path(begun["experiment_file"])
     source = experiment.load(folder / "experiment.py", config["experiment"], original)
     settings = _fill(config["settings"], experiment.to_json(source.experiment), say)
     chosen = experiment.from_json(
@@ -216,15 +215,13 @@ def check_is_run(folder: Path) -> None:
 def _changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[str]:
     """Lists what has changed since the run began and may change what its policy does."""
     builders = (source.experiment.build_env, source.experiment.build_network)
-    then, now = begun.get("source"), source_hashes(builders)
-    then = then if isinstance(then, dict) else {}
+    now, then = source_hashes(builders), begun["source"]
     edited = [name for name, value in now.items() if then.get(name) != value]
     # The run's own copy of its experiment, `source`, cannot have been edited.
     edited = [name for name in edited if module_file(name) != source.path]
     few = ", ".join(edited[:3]) + (f" and {len(edited) - 3} more" if len(edited) > 3 else "")
     found = [f"The code of {few}"] if edited else []
-    model = physics_hash(setup.env)
-    if setup.engine == begun.get("engine") and model != begun.get("model", model):
+    if setup.engine == begun["engine"] and physics_hash(setup.env) != begun["model"]:
         found.append("MuJoCo's model")
     return found
 

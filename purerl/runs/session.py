@@ -58,7 +58,13 @@ def execute(
             setup.config, chosen.evaluation, options.checkpoints, options.log_every
         )
         schedule = {"log_every": plan.log_every, "checkpoints": options.checkpoints}
-        facts = _describe_process(source, chosen, setup, shards.number, options.vmapped_seeds)
+        builders = (chosen.build_env, chosen.build_network)
+        kernels = exact.how_chosen(jax.default_backend())
+        facts = manifest.collect(setup.engine, builders, kernels, shards.number)
+        facts["model"] = build_experiment.physics_hash(setup.env)
+        facts["experiment_file"] = str(source.path)
+        if options.vmapped_seeds > 1:
+            facts["vmapped_seeds"] = {"first": chosen.seed, "number": options.vmapped_seeds}
 
         def prepare() -> bool:
             for folder in runs:
@@ -84,7 +90,8 @@ def execute(
                     calls_host=setup.engine == "c",
                 )  # fmt: skip
             if jax.default_backend() == "gpu" and processes.is_first():
-                _tell_unordered(runs, setup.engine, facts["kernels"], made.unordered)
+                exactness = manifest.exactness(setup.engine, kernels, made.unordered)
+                _tell_unordered(runs, exactness, made.unordered)
             return made
 
         _train_all(runs, Job(options, plan, programs, abstract, facts, stop))
@@ -105,36 +112,19 @@ def _train_all(runs: dict[Path, Experiment], job: Job) -> None:
         raise RunError(" ".join(failed))
 
 
-def _tell_unordered(
-    folders: Iterable[Path], engine: str, kernels: str, unordered: list[str]
-) -> None:
+def _tell_unordered(folders: Iterable[Path], exactness: dict[str, Any], places: list[str]) -> None:
     """Adds to manifest.json, and prints, what is known only when programs are compiled."""
     for folder in folders:
         path = folder / "manifest.json"
-        write_json(path, read_json(path) | manifest.exactness(engine, kernels, unordered))
-    for place in unordered:
+        write_json(path, read_json(path) | exactness)
+    for place in places:
         print(f"Not bit-exact: nothing fixes the order of the sum {place}", flush=True)
-
-
-def _describe_process(
-    source: Source, chosen: Experiment, setup: build_experiment.Setup, shards: int, vmapped: int
-) -> dict[str, Any]:
-    """Returns what the bits depend on besides the settings, as the manifest keeps it."""
-    builders = (chosen.build_env, chosen.build_network)
-    facts = manifest.collect(
-        setup.engine, builders, exact.how_chosen(jax.default_backend()), shards
-    )
-    facts["model"] = build_experiment.physics_hash(setup.env)
-    facts["experiment_file"] = str(source.path)
-    if vmapped > 1:
-        facts["vmapped_seeds"] = {"first": chosen.seed, "number": vmapped}
-    return facts
 
 
 def _shards_on_disk(folders: Iterable[Path]) -> int:
     """Returns how many shards a run was begun with, 0 if there is none yet."""
     begun = [folder for folder in folders if (folder / "config.json").exists()]
-    return read_json(begun[0] / "manifest.json").get("num_shards", 1) if begun else 0
+    return read_json(begun[0] / "manifest.json")["num_shards"] if begun else 0
 
 
 def _choose_shards(config: Config, abstract: PyTree, options: Options, begun_with: int) -> Shards:

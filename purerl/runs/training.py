@@ -125,12 +125,9 @@ def stop_signals(end: Callable[[int], Any]) -> Iterator[Callable[[], bool]]:
             end(128 + number)
             return
         received.append(number)
-        print(
-            f"\n{signal.Signals(number).name}: finishing this chunk, then saving. "
-            "Once more to stop at once.",
-            file=sys.stderr,
-            flush=True,
-        )
+        name = signal.Signals(number).name
+        said = f"\n{name}: finishing this chunk, then saving. Once more to stop at once."
+        print(said, file=sys.stderr, flush=True)
 
     old = {}
     if threading.current_thread() is threading.main_thread():

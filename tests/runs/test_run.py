@@ -379,7 +379,7 @@ def test_a_failing_logger_does_not_stop_training(whole, tmp_path, monkeypatch, c
         raise RuntimeError("the server is on fire")
 
     pytest.importorskip("tensorboardX")
-    monkeypatch.setattr(loggers.TensorBoardSink, "log", fail)
+    monkeypatch.setattr(loggers._TensorBoardSink, "log", fail)
     assert start(tmp_path, "--checkpoints", "4", "--tensorboard") == SUCCESS
     assert capsys.readouterr().out.count("TensorBoard logger is dropped") == 1
     assert lines(tmp_path) == lines(whole)
