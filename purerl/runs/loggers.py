@@ -82,10 +82,6 @@ class MetricsFile:
         self.pending = b""
         return self.offset
 
-    def close(self) -> None:
-        """Closes the file."""
-        self.file.close()
-
 
 class BackgroundLogger:
     """A sink (`log(record)`, `close()`) in a thread of its own.

@@ -83,7 +83,7 @@ class RunWriter:
     def close(self) -> None:
         """Stops the thread and the loggers."""
         self.worker.shutdown()
-        self.metrics.close()
+        self.metrics.file.close()
         for logger in self.loggers:
             logger.close()
 
