@@ -88,6 +88,7 @@ def execute(
         if options.vmapped_seeds > 1:
             facts["vmapped_seeds"] = {"first": chosen.seed, "number": options.vmapped_seeds}
 
+        @run_folder.refusals()
         def prepare() -> bool:
             for folder in runs:
                 stack.enter_context(run_folder.lock(folder))
@@ -101,8 +102,7 @@ def execute(
             print("\n".join(lines), flush=True)
             return not all(checkpoint_folder.updates(folder / "checkpoints") for folder in runs)
 
-        with run_folder.refusals():
-            fresh = alone(prepare)
+        fresh = alone(prepare)
 
         @functools.cache
         def programs() -> Programs:
