@@ -5,12 +5,12 @@ These names are the whole interface. Whatever else is in this package may move.
 Train, and use what was trained:
   train(experiment, settings) -> Run: the same folder, bits and lines as `python -m purerl.run`.
   load(folder) -> Run: a run read back: `policy`, `metrics()`, `evaluate()`, `env`, `state`, ...
-  find(name) -> Experiment: the experiment of that name, file or module.
-  Run, Policy: what `train` and `load` return, and its `policy(observation) -> action`.
+  Run, Policy: what these two return, and its `policy(observation) -> action`.
 
 An experiment:
   Experiment: functions that build the environment and the network, and their settings.
   Config, Evaluation: the settings of PPO, and of the evaluations during training.
+  find(name) -> Experiment: the experiment of that name, file or module.
 
 An environment:
   Env, State: the protocol, and one environment between two steps.
@@ -27,42 +27,18 @@ A network:
 Other:
   exact: a package: programs of MJX with their sums in a fixed order, without the trainer.
   Array, PyTree: for type annotations.
-  UserError, RunError, StoppedError: a mistake of the caller; a run that cannot go on; one that was
-    asked to stop.
+  UserError, RunError, StoppedError: a wrong call; a run that cannot go on; one that was stopped.
 
 A name is imported when it is first used: `import purerl` does not start JAX.
 """
 
-# ruff: noqa: F401
-
 import difflib
 import importlib
 import sys
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:  # the same names, for editors and type checkers
-    from purerl import exact
-    from purerl.core.env import Env, EnvError, State
-    from purerl.core.errors import RunError, StoppedError, UserError
-    from purerl.core.records import Array, Network, Normal, PolicyOutput, PyTree
-    from purerl.physics import lookup
-    from purerl.physics.interface import (
-        Physics,
-        PhysicsState,
-        choose_engine,
-        overflow_metric,
-        overflow_reading,
-    )
-    from purerl.ppo import networks
-    from purerl.ppo.config import Config, Evaluation
-    from purerl.runs.check_env import check_env
-    from purerl.runs.experiment import Experiment, find
-    from purerl.runs.loaded_run import Run, load
-    from purerl.runs.policy import Policy
-    from purerl.runs.training import train
+from typing import Any
 
 __version__ = "0.1.0"
-# Module -> its public names; a name that is the module's own last part is the module.
+# Module -> its public names, as in `__init__.pyi`; `exact`, `lookup` and `networks` are modules.
 _NAMES = {
     "core.env": "Env EnvError State",
     "core.errors": "RunError StoppedError UserError",
@@ -82,20 +58,16 @@ HOMES = {name: f"purerl.{home}" for home, names in _NAMES.items() for name in na
 __all__ = sorted(HOMES)
 
 
-if not TYPE_CHECKING:  # which would then know every name
-
-    def __getattr__(name: str) -> Any:
-        """Imports a public name when it is first used."""
-        if name not in HOMES:
-            raise AttributeError(f"purerl has no name {name!r}: {_hint(name)}")
-        module = importlib.import_module(HOMES[name])
-        found = module if HOMES[name].endswith(f".{name}") else getattr(module, name)
-        globals()[name] = found
-        return found
+def __getattr__(name: str) -> Any:
+    """Imports a public name when it is first used."""
+    if name not in HOMES:
+        raise AttributeError(f"purerl has no name {name!r}: {_hint(name)}")
+    module = importlib.import_module(HOMES[name])
+    globals()[name] = getattr(module, name, module)
+    return globals()[name]
 
 
 def __dir__() -> list[str]:
-    """Lists the public names."""
     return [*__all__, "__version__"]
 
 

@@ -15,9 +15,10 @@ Exit codes: 0 done, 1 the run cannot go on, 2 a mistake in the command, 3 stoppe
 import os
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
-from purerl.core.errors import USAGE, RunError, StoppedError, UserError
+from purerl.core.errors import USAGE, RunError, StoppedError, UserError, one_line
 from purerl.runs import experiment
 from purerl.runs.command_errors import leave, tell
 
@@ -26,19 +27,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(help_page())
+        print(_help_page())
         return 0 if arguments else USAGE
     try:
-        command(arguments)
+        _command(arguments)
     except (UserError, RunError, StoppedError) as error:
         code = tell(error)
         if isinstance(error, StoppedError):
-            print(f"Go on with: {resume_command(arguments)}", file=sys.stderr)
+            more = [] if "--resume" in arguments else ["--resume"]
+            again = shlex.join(["python", "-m", "purerl.run", *arguments, *more])
+            print(f"Go on with: {again}", file=sys.stderr)
         return code
     return 0
 
 
-def help_page() -> str:
+def _help_page() -> str:
     """Returns the page of `python -m purerl.run --help`, without importing JAX."""
     lines = [str(__doc__), "Experiments:"]
     named = experiment.available()
@@ -47,14 +50,10 @@ def help_page() -> str:
     return "\n".join(lines if named else [*lines, "  none in experiments/"])
 
 
-def resume_command(arguments: Sequence[str]) -> str:
-    """Returns the command that goes on with an interrupted run."""
-    more = [] if "--resume" in arguments else ["--resume"]
-    return shlex.join(["python", "-m", "purerl.run", *arguments, *more])
-
-
-def command(arguments: Sequence[str]) -> None:
-    """Parses and trains."""
+def _command(arguments: Sequence[str]) -> None:
+    """Parses, trains, and with --video shows the policy of the first seed."""
+    from purerl import render
+    from purerl.report.renderer import choose_gl
     from purerl.runs import training
     from purerl.runs.command_line import from_command_line
 
@@ -67,8 +66,22 @@ def command(arguments: Sequence[str]) -> None:
     source = experiment.find_source(arguments[0])
     prog = f"python -m purerl.run {arguments[0]}"
     chosen, options = from_command_line(source, arguments[1:], prog)
-    with training.stop_signals(os._exit) as stop:
-        training.train_runs(source, training.runs_of(source, chosen, options), options, stop)
+    if options.video:  # before mujoco is imported, which looks for OpenGL itself
+        _attempt(choose_gl)
+    folders = training.train_runs(source, chosen, options, os._exit)
+    if options.video:
+        from purerl.devices.processes import is_first
+
+        if is_first():
+            _attempt(render.command, render.Options(folders[0]))
+
+
+def _attempt(part: Callable[..., Any], *arguments: Any) -> None:
+    """Calls a part of making a video; a failure is one line, and changes no exit code."""
+    try:
+        part(*arguments)
+    except Exception as error:
+        print(f"purerl: There is no video: {one_line(error)}", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ import jax
 import jax.numpy as jnp
 
 from experiments.benchmarks import start_up
+from experiments.benchmarks.output import output_file
 from purerl import exact
 from purerl.core.records import Array, Network, PyTree, TrainState
 from purerl.physics.lookup import scale_action
@@ -40,7 +41,6 @@ from purerl.runs import build_experiment, command_line
 from purerl.runs.command_errors import leave
 from purerl.runs.console import size
 from purerl.runs.experiment import Experiment, find_source
-from purerl.runs.files import output_file
 
 PARTS = ("physics alone", "rollout", "learner", "update", "evaluation")
 

@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 import jax
 
 from experiments.benchmarks.benchmark import compile_part, measure
+from experiments.benchmarks.output import output_file
 from purerl import exact
 from purerl.core.errors import UserError
 from purerl.ppo import algorithm
@@ -33,7 +34,6 @@ from purerl.runs import build_experiment
 from purerl.runs.command_errors import leave
 from purerl.runs.command_line import from_command_line
 from purerl.runs.experiment import Experiment, find_source
-from purerl.runs.files import output_file
 
 HERE = sorted(os.sched_getaffinity(0))  # cores that this process may use
 AXES: dict[str, tuple[int, ...]] = {

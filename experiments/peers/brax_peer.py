@@ -34,6 +34,7 @@ import jax
 import jax.numpy as jnp
 
 from experiments.benchmarks.benchmark import Part, measure
+from experiments.benchmarks.output import output_file
 from experiments.peers import brax_env, brax_network
 from experiments.peers.sb3 import Ours
 from purerl import exact
@@ -45,7 +46,6 @@ from purerl.ppo.config import Config, Evaluation
 from purerl.runs import build_experiment
 from purerl.runs.command_errors import leave
 from purerl.runs.experiment import Experiment
-from purerl.runs.files import output_file
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from experiments.benchmarks.output import output_file
 from experiments.peers.brax_peer import BODIES, Published, our_experiment, resize, train_brax
 from purerl import exact
 from purerl.core.errors import UserError
@@ -37,7 +38,6 @@ from purerl.ppo.config import Evaluation
 from purerl.report import bootstrap
 from purerl.runs import build_experiment
 from purerl.runs.command_errors import leave
-from purerl.runs.files import output_file
 
 NUM_EPISODES = 128
 PHYSICS = {"purerl": "purerl", "purerl-on-brax": "mjx"}  # ours -> whose

@@ -29,13 +29,13 @@ from typing import Any, NamedTuple
 import jax
 
 from experiments.benchmarks.benchmark import Part, Timing, measure
+from experiments.benchmarks.output import output_file
 from experiments.peers.gymnasium_ant import experiment
 from purerl.ppo import algorithm
 from purerl.ppo.config import Config
 from purerl.ppo.networks import MlpOptions
 from purerl.runs import build_experiment
 from purerl.runs.command_errors import leave
-from purerl.runs.files import output_file
 
 
 class Sizes(NamedTuple):

@@ -12,20 +12,18 @@ import numpy as np
 
 def write(path: Path, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
     """Writes arrays and JSON values as one folder, which appears whole or not at all."""
-    ocp = _orbax()
+    args = _orbax().args
+    whole = args.Composite(state=args.StandardSave(arrays), meta=args.JsonSave(meta))
     with _checkpointer() as checkpointer:
-        checkpointer.save(
-            path.absolute(),
-            ocp.args.Composite(state=ocp.args.StandardSave(arrays), meta=ocp.args.JsonSave(meta)),
-        )
+        checkpointer.save(path.absolute(), whole)
 
 
 def read(path: Path, like: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Reads arrays of the names, shapes and dtypes of `like`; raises what Orbax raises."""
-    ocp = _orbax()
+    args = _orbax().args
     with _checkpointer() as checkpointer:
-        arguments = ocp.args.Composite(state=ocp.args.StandardRestore(like))
-        return checkpointer.restore(path.absolute(), arguments).state
+        wanted = args.Composite(state=args.StandardRestore(like))
+        return checkpointer.restore(path.absolute(), wanted).state
 
 
 def flush(path: Path) -> None:
@@ -66,10 +64,9 @@ def _orbax() -> Any:
 
 
 def _print_unraisable(raised: Any) -> None:
-    """Prints what could not be raised, but for the writes that a failed save leaves under way.
+    """Prints what could not be raised, but not what a failed save's unfinished writes end with.
 
-    They end one by one in threads of the storage library, each with the same complaint; the save
-    has been reported as failed by then.
+    They end one by one, in threads of the storage library, after the failure has been reported.
     """
     if str(raised.exc_value) != "Event loop is closed":
         sys.__unraisablehook__(raised)

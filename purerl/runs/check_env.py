@@ -8,6 +8,7 @@ import numpy as np
 
 from purerl.core.env import ABSURD, Env, EnvError, State
 from purerl.core.records import Array, PyTree, is_key
+from purerl.runs.state_arrays import flatten
 
 
 def check_env(env: Env, num_envs: int = 4, num_steps: int = 4) -> None:
@@ -27,8 +28,16 @@ def check_env(env: Env, num_envs: int = 4, num_steps: int = 4) -> None:
     state = reset(_again(keys))
     _check_bits("equal keys", state, reset(keys), "reset must be a function of its key alone")
     _check_differs(state)
-    actions = _actions(num_steps, num_envs, env.action_size)
-    rollout = _rollout(env)
+    shape = (num_envs, env.action_size)
+    corners = [jnp.full((1, *shape), number) for number in (-1.0, 0.0, 1.0)]
+    noise = jax.random.uniform(jax.random.key(1), (num_steps, *shape), minval=-1.0, maxval=1.0)
+    actions = jnp.concatenate([*corners, noise])
+
+    @jax.jit
+    def rollout(state: State, actions: Array) -> tuple[State, State]:
+        step = jax.vmap(env.step)
+        return jax.lax.scan(lambda s, action: (step(s, action),) * 2, state, actions)
+
     last, states = rollout(_again(state), actions)
     _check_finite("reset", state)
     _check_finite("step", states)
@@ -43,7 +52,15 @@ def check_shapes(env: Env) -> None:
     check_members(env)
     fresh = jax.eval_shape(env.reset, jax.random.key(0))
     _check_fields(fresh)
-    _check_same("reset and step", _specs(fresh), _specs(_step_shapes(env, fresh)))
+    action = jax.ShapeDtypeStruct((env.action_size,), jnp.float32)
+    try:
+        following = jax.eval_shape(env.step, fresh, action)
+    except Exception as error:
+        raise EnvError(
+            f"step cannot be traced with an action of env.action_size = {env.action_size} "
+            f"numbers, as jit needs: {error}"
+        ) from error
+    _check_same(_specs(fresh), _specs(following))
 
 
 def check_members(env: Env) -> None:
@@ -65,20 +82,8 @@ def check_members(env: Env) -> None:
         raise EnvError(f"env.action_size is {size!r}: it must be a positive int.")
 
 
-def _step_shapes(env: Env, fresh: State) -> Any:
-    """Returns the shapes that step makes of a state, by tracing it once."""
-    action = jax.ShapeDtypeStruct((env.action_size,), jnp.float32)
-    try:
-        return jax.eval_shape(env.step, fresh, action)
-    except Exception as error:
-        raise EnvError(
-            f"step cannot be traced with an action of env.action_size = {env.action_size} "
-            f"numbers, as jit needs: {error}"
-        ) from error
-
-
 def _check_fields(state: Any) -> None:
-    """The fields that every trainer reads, from the shapes of one fresh state."""
+    """Checks the fields that every trainer reads, from the shapes of one fresh state."""
     if not isinstance(state, State):
         raise EnvError(f"reset returned a {type(state).__name__}: it must return env.State.")
     rules = {"reward": jnp.float32, "terminated": jnp.bool_, "truncated": jnp.bool_}
@@ -116,20 +121,22 @@ def _specs(state: State) -> dict[str, str]:
     return {jax.tree_util.keystr(path).lstrip("."): _describe(leaf) for path, leaf in leaves}
 
 
-def _check_same(what: str, first: dict[str, str], second: dict[str, str]) -> None:
-    """Shapes, dtypes and names must not depend on where a state came from, or scan fails."""
-    for name in sorted(first.keys() ^ second.keys()):
-        where = "reset only" if name in first else "step only"
-        raise EnvError(f"{name} is in the state of {where}: {what} must return the same fields.")
-    for name, spec in first.items():
-        if "weakly" in spec + second[name]:
+def _check_same(reset: dict[str, str], step: dict[str, str]) -> None:
+    """Names, shapes and dtypes must not depend on where a state came from, or scan fails."""
+    for name in sorted(reset.keys() ^ step.keys()):
+        where = "reset" if name in reset else "step"
+        raise EnvError(
+            f"{name} is in the state of {where} only: reset and step must return the same fields."
+        )
+    for name, spec in reset.items():
+        if "weakly" in spec + step[name]:
             raise EnvError(
-                f"{name} is weakly typed ({spec}; {second[name]}): give it a dtype, as "
-                "in jnp.float32(0) or jnp.zeros(())."
+                f"{name} is weakly typed ({spec}; {step[name]}): give it a dtype, as in "
+                "jnp.float32(0) or jnp.zeros(())."
             )
-        if spec != second[name]:
+        if spec != step[name]:
             raise EnvError(
-                f"{name} is {spec} from reset and {second[name]} from step: {what} must "
+                f"{name} is {spec} from reset and {step[name]} from step: reset and step must "
                 "return the same shapes and dtypes."
             )
 
@@ -139,35 +146,8 @@ def _again(tree: PyTree) -> PyTree:
     return jax.tree.map(lambda x: jax.random.clone(x) if is_key(x) else x, tree)
 
 
-def _actions(num_steps: int, num_envs: int, size: int) -> Array:
-    """Returns actions [3 + T, B, A]: all -1, all 0, all 1, then random ones."""
-    corners = jnp.broadcast_to(jnp.array([-1.0, 0.0, 1.0])[:, None, None], (3, num_envs, size))
-    shape = (num_steps, num_envs, size)
-    noise = jax.random.uniform(jax.random.key(1), shape, minval=-1.0, maxval=1.0)
-    return jnp.concatenate([corners, noise])
-
-
-def _rollout(env: Env):
-    """Returns a jitted (state [B], actions [T, B, A]) -> (state [B], states [T, B])."""
-
-    def step(state, action):
-        state = jax.vmap(env.step)(state, action)
-        return state, state
-
-    return jax.jit(lambda state, actions: jax.lax.scan(step, state, actions))
-
-
-def _host_leaves(state: PyTree) -> dict[str, np.ndarray]:
-    """Returns path -> values of each leaf; keys as their raw bits."""
-    named = {}
-    for path, leaf in jax.tree_util.tree_leaves_with_path(state):
-        value = jax.random.key_data(leaf) if is_key(leaf) else leaf
-        named[jax.tree_util.keystr(path).lstrip(".")] = np.asarray(value)
-    return named
-
-
 def _check_finite(when: str, state: PyTree) -> None:
-    for name, value in _host_leaves(state).items():
+    for name, value in flatten(state).items():
         # A NaN fails the comparison.
         if np.issubdtype(value.dtype, np.floating) and not (np.abs(value) <= ABSURD).all():
             what = f"{np.abs(value).max():.3g}" if np.isfinite(value).all() else "not finite"
@@ -178,15 +158,15 @@ def _check_finite(when: str, state: PyTree) -> None:
 
 
 def _check_bits(what: str, first: PyTree, second: PyTree, rule: str) -> None:
-    other = _host_leaves(second)
-    for name, value in _host_leaves(first).items():
+    other = flatten(second)
+    for name, value in flatten(first).items():
         if value.tobytes() != other[name].tobytes():
             raise EnvError(f"{name} differs between two calls with {what}: {rule}.")
 
 
 def _check_differs(state: State) -> None:
     """Different keys must give different starts, or B environments are one."""
-    leaves = _host_leaves((state.physics, state.observation, state.task)).values()
+    leaves = flatten((state.physics, state.observation, state.task)).values()
     if not any((leaf[0] != leaf[1]).any() for leaf in leaves):
         raise EnvError(
             "physics, observation and task are the same for different keys: reset must "

@@ -1,11 +1,8 @@
 """Checkpoints: a whole TrainState on disk, with a hash of every leaf, so that damage is noticed.
 
 Orbax commits a checkpoint by renaming a finished folder, which survives a kill at any moment. But
-it checks no array bytes, it deletes in place, and its idea of the latest step goes wrong on a full
-disk. So this package keeps hashes beside the arrays and looks after the folder itself
-(`checkpoint_folder.py`).
-
-Zero-size arrays, which Orbax refuses, count in the digest but are not written.
+it checks no array bytes, deletes in place, and mistakes the latest step on a full disk. So hashes
+are kept beside the arrays, and `checkpoint_folder.py` looks after the folder.
 """
 
 import contextlib
@@ -19,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from purerl.core.errors import UserError, one_line
-from purerl.core.records import PyTree, is_key
+from purerl.core.records import PyTree
 from purerl.runs import array_files, checkpoint_folder
 from purerl.runs.checkpoint_folder import DamagedError, load_meta, path_of
-from purerl.runs.state_arrays import Leaves, digest_leaves, leaf_paths, unflatten
+from purerl.runs.state_arrays import Leaves, digest_leaves, leaf_paths, raw, unflatten
 
 
 class Saved(NamedTuple):
@@ -46,7 +43,7 @@ def save(folder: Path, leaves: Leaves, meta: dict[str, Any]) -> Path:
     meta = meta | {"leaves": {path: _describe(array) for path, array in leaves.items()}}
     path = path_of(folder, meta["update"])
     checkpoint_folder.discard(path)
-    stored = {key: array for key, array in leaves.items() if array.size}
+    stored = {key: array for key, array in leaves.items() if array.size}  # Orbax refuses empty ones
     try:
         array_files.write(path, stored, meta | {"meta_sha256": checkpoint_folder.hash_meta(meta)})
         array_files.flush(path)
@@ -70,22 +67,17 @@ def load(path: Path, abstract: PyTree) -> Saved:
     """
     meta = load_meta(path)
     _check_fits(path, meta, abstract)
-    leaves = {
-        key: np.zeros(about["shape"], jnp.dtype(about["dtype"]))
-        for key, about in meta["leaves"].items()
-    }
-    target = {key: array for key, array in leaves.items() if array.size}
+    stored = meta["leaves"].items()
+    leaves = {key: np.zeros(about["shape"], jnp.dtype(about["dtype"])) for key, about in stored}
     try:
-        leaves |= array_files.read(path, target)
+        leaves |= array_files.read(path, {key: x for key, x in leaves.items() if x.size})
     except (PermissionError, MemoryError) as error:  # no damage: it shall not be put aside
         raise UserError(f"The checkpoint {path} cannot be read: {one_line(error)}") from error
     except Exception as error:  # Orbax raises many kinds for broken files, none of them its own
         raise DamagedError(f"its arrays cannot be read ({type(error).__name__})") from error
-    for key, about in meta["leaves"].items():
+    for key, about in stored:
         if _describe(leaves[key]) != about:
-            raise DamagedError(
-                f"leaf {key} does not have the bytes that were written (sha256 differs)"
-            )
+            raise DamagedError(f"leaf {key} is not what was written (sha256 differs)")
     if digest_leaves(leaves) != meta["digest"]:
         raise DamagedError("the digest of all leaves differs from the one written with them")
     return Saved(unflatten(leaves, abstract), meta)
@@ -100,8 +92,7 @@ def newest(
       folders: the checkpoints of a run, or of each of the seeds that train together.
       abstract: shapes of one seed's state.
       say: told of each damaged checkpoint.
-      rename: whether to rename damaged ones to `damaged-<n>-<update>`; False where another process
-        may be writing the run.
+      rename: whether to rename damaged ones; False where another process may write the run.
 
     Returns:
       One checkpoint for each folder; [] if there is no such update.
@@ -130,22 +121,19 @@ def check_fits(folder: Path, abstract: PyTree) -> None:
             return
 
 
-# --- parts ---
-
-
 def _describe(array: np.ndarray) -> dict[str, Any]:
     content = hashlib.sha256(np.asarray(array).tobytes()).hexdigest()
     return {"dtype": str(array.dtype), "shape": list(array.shape), "sha256": content}
 
 
 def _check_fits(path: Path, meta: dict[str, Any], abstract: PyTree) -> None:
-    raw = jax.eval_shape(
-        lambda s: jax.tree.map(lambda x: jax.random.key_data(x) if is_key(x) else x, s), abstract
-    )
-    shapes = [[str(x.dtype), list(x.shape)] for x in jax.tree.leaves(raw)]
+    shapes = [[str(x.dtype), list(x.shape)] for x in jax.tree.leaves(jax.eval_shape(raw, abstract))]
     wanted = dict(zip(leaf_paths(abstract), shapes, strict=True))
-    stored = {key: [about["dtype"], about["shape"]] for key, about in meta["leaves"].items()}
-    stored = {key: shape for key, shape in stored.items() if not _is_left_out(key, abstract)}
+    stored = {
+        key: [about["dtype"], about["shape"]]
+        for key, about in meta["leaves"].items()
+        if getattr(abstract, key.partition("/")[0], key) is not None  # None: left out
+    }
     for key in sorted({*wanted, *stored}):
         if wanted.get(key) != stored.get(key):
             raise UserError(
@@ -153,7 +141,3 @@ def _check_fits(path: Path, meta: dict[str, Any], abstract: PyTree) -> None:
                 f"{stored.get(key, 'absent')} in it and {wanted.get(key, 'absent')} in this "
                 "experiment. Use the settings and the version of purerl that the run began with."
             )
-
-
-def _is_left_out(key: str, abstract: PyTree) -> bool:
-    return getattr(abstract, key.partition("/")[0], key) is None

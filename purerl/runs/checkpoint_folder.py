@@ -1,10 +1,10 @@
 """The folder `checkpoints/` of a run: which updates it holds, their metadata, what may go. No JAX.
 
 A checkpoint is a folder named after its update. Its metadata hold a hash of themselves, so that
-damage is noticed. It is renamed before it is deleted: a kill in between leaves nothing that looks
-whole. `checkpoint.py` reads and writes the arrays.
+damage is noticed. `checkpoint.py` reads and writes the arrays.
 """
 
+import contextlib
 import hashlib
 import json
 import shutil
@@ -57,12 +57,9 @@ def best_update(folder: Path) -> int | None:
     """Returns the update of the checkpoint with the highest evaluation return, None without any."""
     scored = []
     for update in updates(folder):
-        try:
+        with contextlib.suppress(DamagedError):
             score = load_meta(path_of(folder, update))["eval_return"]
-        except DamagedError:
-            continue
-        if score is not None:
-            scored.append((score, update))
+            scored += [(score, update)] if score is not None else []
     return max(scored)[1] if scored else None
 
 
@@ -92,10 +89,9 @@ def retain(folder: Path, keep: int, together: Sequence[Path] = ()) -> None:
       together: the folders of all seeds that train together. Then only checkpoints that all of
         them have are counted.
     """
-    best = best_update(folder)
     newest = common_updates([folder, *together])[-keep:]
-    for update in updates(folder):
-        if newest and update < newest[0] and update != best:
+    for update in {*updates(folder)} - {best_update(folder)}:
+        if newest and update < newest[0]:
             discard(path_of(folder, update))
 
 

@@ -3,9 +3,7 @@
 import os
 import signal
 import sys
-import traceback
 from collections.abc import Callable
-from pathlib import Path
 from typing import NoReturn
 
 from purerl.core.errors import RunError, StoppedError, UserError
@@ -34,14 +32,3 @@ def leave(command: Callable[[], int]) -> NoReturn:
     except KeyboardInterrupt:
         code = 128 + signal.SIGINT
     sys.exit(code)
-
-
-def own_line(error: BaseException | None) -> str:
-    """Returns " (FILE, line N)": the last line of the user's own code on the way to an error.
-
-    Code of this library and of installed packages is not the user's. "" if no line is.
-    """
-    frames = traceback.extract_tb(error.__traceback__ if error else None)
-    others = ("site-packages", "dist-packages", str(Path(__file__).parent.parent))
-    own = [frame for frame in frames if not any(other in frame.filename for other in others)]
-    return f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""

@@ -56,13 +56,10 @@ def from_command_line(
     """
     values = experiment.settings(source.experiment)
     kinds = {f.name: f.type for f in dataclasses.fields(Experiment)}
-    fields = [
-        (name, type(value) if dataclasses.is_dataclass(value) else kinds[name],
-         dataclasses.field(kw_only=True))
-        for name, value in values.items()
-    ]  # fmt: skip
+    kinds |= {name: type(v) for name, v in values.items() if dataclasses.is_dataclass(v)}
     # A class made for this experiment: its settings have the types of their values, which is all
     # that the command line needs to know, so an environment's options need no registration.
+    fields = [(name, kinds[name], dataclasses.field(kw_only=True)) for name in values]
     both = dataclasses.make_dataclass("Settings", fields, bases=(Options,), frozen=True)
     both.__doc__ = experiment.summary(source.path) or f"Trains {source.name}."
     parsed = parse(both, arguments, prog, both(**values), config)
@@ -74,14 +71,14 @@ def from_command_line(
 def from_settings(
     source: Source, settings: Mapping[str, Any], options: Mapping[str, Any]
 ) -> tuple[Experiment, Options]:
-    """Returns the same as `from_command_line`, from Python values, checked in the same way.
+    """Returns the same as `from_command_line`, checked in the same way, from Python values.
 
     Args:
       source: the experiment.
       settings: "ppo.num_envs" -> value.
       options: "num_seeds" -> value.
     """
-    words = [word for pair in (dict(settings) | dict(options)).items() for word in _words(*pair)]
+    words = [word for pair in {**settings, **options}.items() for word in _words(*pair)]
     return from_command_line(source, words, f"python -m purerl.run {source.name}", WORDS)
 
 
@@ -102,18 +99,18 @@ def parse(
     Raises:
       UserError: there is no such option (the message has the nearest one), or a value is wrong.
     """
-    extra = {} if default is None else {"default": default}
     said = io.StringIO()
+    extra = {} if default is None else {"default": default}
     try:
         with contextlib.redirect_stderr(said):
             return tyro.cli(kind, args=list(arguments), prog=prog, config=config, **extra)
     except SystemExit as error:
         if not error.code:
             raise
-        raise UserError(f"{one_line(said.getvalue())} All options: {prog} --help") from error
+        raise UserError(f"{_one_line(said.getvalue())} All options: {prog} --help") from error
 
 
-def one_line(text: str) -> str:
+def _one_line(text: str) -> str:
     """Returns tyro's framed, coloured message as one line: what is wrong, and the nearest fix."""
     text = re.sub(r"\x1b\[[0-9;]*m", "", text)
     plain = " ".join(re.sub(r"[─-╿]", " ", text).split())

@@ -22,56 +22,46 @@ SLOW_BEGINNINGS = {"warp": "; its kernels, once on a machine, take a minute or m
 def describe_plan(
     plan: Plan, setup: Setup, abstract: PyTree, facts: dict[str, Any], runs: list[Path], cache: str
 ) -> list[str]:
-    """Returns every derived number of a run, as lines, before anything heavy starts."""
+    """Returns every derived number of a run, as lines, before anything heavy starts.
+
+    Args:
+      plan: the run's sizes.
+      setup: the experiment's objects.
+      abstract: shapes of the state.
+      facts: of manifest.json.
+      runs: the folder of each seed.
+      cache: the folder of compiled programs.
+    """
     left = setup.config.num_steps - plan.steps
     rounded = f", {left:,} fewer than num_steps: whole updates only" if left else ""
-    device = facts["device"]
-    return [
-        f"run          {runs[0]}",
-        *_seeds(runs, facts),
-        f"updates      {plan.updates:,} of {plan.steps_per_update:,} steps",
-        f"steps        {plan.steps:,}{rounded}",
-        f"evaluations  {_ticks(plan.evaluations)}",
-        f"checkpoints  {_ticks(plan.checkpoints)}",
-        f"metrics      a line every {plan.log_every} updates",
-        f"parameters   {count(abstract.params):,}",
-        f"state        {size(abstract) / 1e6:,.1f} MB",
-        f"engine       {setup.engine}{SLOW_BEGINNINGS.get(setup.engine, '')}",
-        *_shards(setup, facts),
-        f"device       {facts['devices']} x {device['kind']} ({device['platform']})",
-        f"cache        {cache}",
-        f"bit-exact    {_exactness(facts)}",
-    ]
-
-
-def _exactness(facts: dict[str, Any]) -> str:
-    return "yes" if facts["bit_exact"] else f"no: {'; '.join(facts['inexact_because'])}"
-
-
-def _shards(setup: Setup, facts: dict[str, Any]) -> list[str]:
-    number, devices = facts["num_shards"], facts["devices"]
-    if number == 1:
-        return []
+    number, devices, kind = facts["num_shards"], facts["devices"], facts["device"]
     each = f"{setup.config.num_envs // number} environments each, {number // devices} on a device"
-    return [f"shards       {number}, {each}"]
-
-
-def _seeds(runs: list[Path], facts: dict[str, Any]) -> list[str]:
-    if len(runs) == 1:
-        return []
     how = "one after another: the bits of single runs"
     if "vmapped_seeds" in facts:
         how = "vmapped: the statistics of single runs, other bits"
-    return [f"seeds        {len(runs)}, to {runs[-1].name}, {how}"]
+    inexact = "; ".join(facts["inexact_because"])
+    parameters = sum(leaf.size for leaf in jax.tree.leaves(abstract.params))
+    lines = {
+        "run": runs[0],
+        "seeds": len(runs) > 1 and f"{len(runs)}, to {runs[-1].name}, {how}",
+        "updates": f"{plan.updates:,} of {plan.steps_per_update:,} steps",
+        "steps": f"{plan.steps:,}{rounded}",
+        "evaluations": _ticks(plan.evaluations),
+        "checkpoints": _ticks(plan.checkpoints),
+        "metrics": f"a line every {plan.log_every} updates",
+        "parameters": f"{parameters:,}",
+        "state": f"{size(abstract) / 1e6:,.1f} MB",
+        "engine": f"{setup.engine}{SLOW_BEGINNINGS.get(setup.engine, '')}",
+        "shards": number > 1 and f"{number}, {each}",
+        "device": f"{devices} x {kind['kind']} ({kind['platform']})",
+        "cache": cache,
+        "bit-exact": f"no: {inexact}" if inexact else "yes",
+    }
+    return [f"{name:12} {value}" for name, value in lines.items() if value]
 
 
 def _ticks(updates: tuple[int, ...]) -> str:
     return f"{len(updates)}, the first after update {updates[0]:,}" if updates else "none"
-
-
-def count(tree: PyTree) -> int:
-    """Returns the number of numbers in a tree."""
-    return sum(leaf.size for leaf in jax.tree.leaves(tree))
 
 
 def size(tree: PyTree) -> int:
@@ -79,29 +69,38 @@ def size(tree: PyTree) -> int:
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
-class Lines:
+class _Lines:
     """Progress as plain lines, for logs and pipes."""
 
     def __init__(self, updates: int) -> None:
-        """Shows how far of `updates` a run is."""
         self.updates = updates
         self.shown = 0.0  # when, by the monotonic clock [s]
 
     def say(self, line: str) -> None:
-        """Prints a line."""
         print(line, flush=True)
 
     def show(self, record: Record, seconds_left: float, steps_per_second: float) -> None:
         """Prints a line for a chunk, unless one has just been printed."""
-        now = time.monotonic()
-        last = record["update"] >= self.updates
-        if now - self.shown < SECONDS_BETWEEN_LINES and not last:
-            return
-        self.shown = now
-        self.say(
-            f"update {record['update']}/{self.updates}  "
-            + figures(record, seconds_left, steps_per_second)
-        )
+        now, update = time.monotonic(), record["update"]
+        if now - self.shown >= SECONDS_BETWEEN_LINES or update >= self.updates:
+            self.shown = now
+            text = figures(record, seconds_left, steps_per_second)
+            self.say(f"update {update}/{self.updates}  {text}")
+
+
+class _Bar:
+    """Progress as a live bar, for a terminal; `bar` is a `rich` display."""
+
+    def __init__(self, updates: int, bar: Any) -> None:
+        self.bar = bar
+        self.task = bar.add_task("", total=updates)
+
+    def say(self, line: str) -> None:
+        self.bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    def show(self, record: Record, seconds_left: float, steps_per_second: float) -> None:
+        text = figures(record, seconds_left, steps_per_second)
+        self.bar.update(self.task, completed=record["update"], description=text)
 
 
 def figures(record: Record, seconds_left: float, steps_per_second: float) -> str:
@@ -116,32 +115,17 @@ def figures(record: Record, seconds_left: float, steps_per_second: float) -> str
     return f"steps {record['steps']:,}  return {shown}{warning}  {rate}  left {left}"
 
 
-class Bar:
-    """Progress as a live bar, for a terminal."""
-
-    def __init__(self, updates: int, bar: Any) -> None:
-        """Drives a `rich` progress display."""
-        self.bar = bar
-        self.task = bar.add_task("", total=updates)
-
-    def say(self, line: str) -> None:
-        """Prints a line above the bar."""
-        self.bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
-
-    def show(self, record: Record, seconds_left: float, steps_per_second: float) -> None:
-        """Moves the bar."""
-        text = figures(record, seconds_left, steps_per_second)
-        self.bar.update(self.task, completed=record["update"], description=text)
-
-
 @contextmanager
-def progress(updates: int) -> Iterator[Lines | Bar]:
-    """Yields a live bar where standard output is a terminal, plain lines elsewhere."""
+def progress(updates: int) -> Iterator[_Lines | _Bar]:
+    """Yields what shows progress: a live bar on a terminal, plain lines elsewhere.
+
+    It has `say(line)`, and `show(record, seconds_left, steps_per_second)` for each chunk.
+    """
     if not sys.stdout.isatty():
-        yield Lines(updates)
+        yield _Lines(updates)
         return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
     columns = (BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"))
     with Progress(*columns) as bar:
-        yield Bar(updates, bar)
+        yield _Bar(updates, bar)

@@ -1,22 +1,19 @@
 """Experiments: builder functions and the data they are called with, in one file a person copies.
 
-This module imports nothing heavy, so that a list of experiments or a help page comes at once.
+Nothing heavy is imported here, so that a list of experiments or a help page comes at once.
 """
 
 import ast
 import contextlib
 import dataclasses
 import enum
-import importlib
 import importlib.util
-import itertools
 import re
 import sys
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Annotated, Any, Literal, NamedTuple
 
 import tyro
@@ -60,12 +57,10 @@ class Source(NamedTuple):
     path: Path
 
 
-FOUND: list[Source] = []  # by `find`: so that `train` knows an experiment's file by its object
-
 # --- finding ---
 
 
-def folders() -> list[Path]:
+def _folders() -> list[Path]:
     """Returns where named experiments are looked for: here, then beside the library."""
     places = [Path.cwd() / "experiments", Path(__file__).parents[2] / "experiments"]
     return [place for place in dict.fromkeys(places) if place.is_dir()]
@@ -77,18 +72,15 @@ def available() -> dict[str, Path]:
     They come in the order in which the folder's `__init__.py` mentions them, the others after.
     """
     found: dict[str, Path] = {}
-    for folder in folders():
+    for folder in _folders():
         about = folder / "__init__.py"
         order = re.findall(r"\w+", about.read_text()) if about.exists() else []
-        files = [file for file in sorted(folder.glob("*.py")) if defines_experiment(file)]
+        # Other scripts may stand beside the experiments.
+        has_one = re.compile(r"^experiment(: *Experiment)? = ", re.MULTILINE)
+        files = [file for file in sorted(folder.glob("*.py")) if has_one.search(file.read_text())]
         files.sort(key=lambda file: order.index(file.stem) if file.stem in order else len(order))
         found = found | {file.stem: file for file in files if file.stem not in found}
     return found
-
-
-def defines_experiment(file: Path) -> bool:
-    """Tells whether a file gives its `experiment` a value; other scripts may stand beside it."""
-    return bool(re.search(r"^experiment(: *Experiment)? = ", file.read_text(), re.MULTILINE))
 
 
 def summary(path: Path) -> str:
@@ -106,23 +98,24 @@ def find(name: str) -> Experiment:
     >>> find("cartpole_swingup").ppo.num_envs
     64
     """
-    FOUND.append(find_source(name))
-    return FOUND[-1].experiment
+    return find_source(name).experiment
 
 
 def find_source(name: str) -> Source:
     """Loads an experiment by name, path or module; see `find`."""
     named = available()
     if name.endswith(".py") or "/" in name:
-        path = Path(name)
-        if not path.is_file():
+        if not Path(name).is_file():
             raise UserError(f"There is no experiment file {name}.")
-        return load(path)
+        return load(Path(name))
     if name in named:
         return load(named[name])
-    if "." in name:
-        return _from_module(name)
-    places = f" in {' or '.join(map(str, folders())) or 'sight'}"
+    spec = None
+    with contextlib.suppress(ImportError, ValueError):
+        spec = importlib.util.find_spec(name) if "." in name else None
+    if spec is not None and str(spec.origin).endswith(".py"):
+        return load(Path(str(spec.origin)))
+    places = f" in {' or '.join(map(str, _folders())) or 'sight'}"
     raise UserError(unknown_name("experiment", name, named, places))
 
 
@@ -137,27 +130,38 @@ def load(path: Path, name: str = "", copy_of: Path | None = None) -> Source:
     """
     path = path.resolve()
     place = copy_of if copy_of is not None and copy_of.is_file() else path
-    return _checked(_execute(_module_name(path), path, place), name or path.stem, path)
-
-
-def _module_name(path: Path) -> str:
-    """Returns a file's name as a module: in a package its own, so that its source counts there."""
-    in_package = lambda folder: (folder / "__init__.py").exists()  # noqa: E731
-    package = list(itertools.takewhile(in_package, path.parents))
-    if package and str(package[-1].parent) in sys.path:
-        return ".".join(path.with_suffix("").relative_to(package[-1].parent).parts)
-    return f"purerl_experiment_{path.stem}"
-
-
-def _execute(module_name: str, path: Path, place: Path) -> ModuleType:
+    module_name = _module_name(path)
     spec = importlib.util.spec_from_file_location(module_name, path)
     assert spec is not None and spec.loader is not None  # it is an existing .py file
     module = importlib.util.module_from_spec(spec)
     sys.modules[module_name] = module  # dataclasses and help texts look their module up
     module.__file__ = str(place)
     with _mistakes(str(path), place):
+        nodes = list(ast.walk(ast.parse(path.read_text(), str(path))))
+    if any(isinstance(node, ast.ImportFrom) and node.level for node in nodes):
+        raise UserError(
+            f"{path} imports relatively (from . import ...), and a run keeps a copy of the file "
+            "that has to work alone: import by the full name."
+        )
+    with _mistakes(str(path), place):
         spec.loader.exec_module(module)
-    return module
+    found = getattr(module, "experiment", None)
+    if not isinstance(found, Experiment):
+        raise UserError(f"{path} defines no `experiment = Experiment(...)` (it is {found!r}).")
+    for field in ("env", "network", "ppo", "evaluation"):
+        if not _has_settings(value := getattr(found, field)):
+            raise UserError(f"{path}: {field} is {value!r}; it must be a frozen dataclass's value.")
+    return Source(found, name or path.stem, path)
+
+
+def _module_name(path: Path) -> str:
+    """Returns a file's name as a module: in a package its own, so that its source counts there."""
+    root = path.parent
+    while (root / "__init__.py").exists():
+        root = root.parent
+    if root != path.parent and str(root) in sys.path:
+        return ".".join(path.with_suffix("").relative_to(root).parts)
+    return f"purerl_experiment_{path.stem}"
 
 
 @contextlib.contextmanager
@@ -174,73 +178,40 @@ def _mistakes(file: str, place: Path) -> Iterator[None]:
         frames = traceback.extract_tb(error.__traceback__)
         lines = [frame.lineno for frame in frames if frame.filename == file]
         where = f", line {lines[-1]}" if lines else ""
-        raise UserError(f"{file}{where}: {one_line(error)}{_hint(file, place, error)}") from error
-
-
-def _hint(file: str, original: Path, error: Exception) -> str:
-    """Returns what to do about a module that a file imports and that is not found."""
-    beside = original.parent
-    if isinstance(error, ModuleNotFoundError) and error.name == "purerl":
-        of_run = (Path(file).parent / "config.json").exists()
-        return " The run was made by an older purerl: train it anew." if of_run else ""
-    if isinstance(error, ModuleNotFoundError) and error.name:
-        place = beside / error.name.partition(".")[0]
-        if place.is_dir() or place.with_suffix(".py").exists():
-            return f"; it stands beside the file: set PYTHONPATH={beside}"
-    return ""
-
-
-def _from_module(name: str) -> Source:
-    try:
-        spec = importlib.util.find_spec(name)
-    except (ImportError, ValueError):
-        spec = None
-    if spec is None or spec.origin is None:
-        raise UserError(unknown_name("experiment", name, available()))
-    path = Path(spec.origin)
-    with _mistakes(spec.origin, path):
-        module = importlib.import_module(name)
-        nodes = list(ast.walk(ast.parse(path.read_text())))
-    if any(isinstance(node, ast.ImportFrom) and node.level for node in nodes):
-        raise UserError(
-            f"{path} imports relatively (from . import ...), and a run keeps a copy of the file "
-            "that has to work alone: import by the full name."
-        )
-    return _checked(module, name.rpartition(".")[2], path)
-
-
-def _checked(module: ModuleType, name: str, path: Path) -> Source:
-    found = getattr(module, "experiment", None)
-    if not isinstance(found, Experiment):
-        raise UserError(f"{path} defines no `experiment = Experiment(...)` (it is {found!r}).")
-    for field in ("env", "network", "ppo", "evaluation"):
-        value = getattr(found, field)
-        if not dataclasses.is_dataclass(value) or isinstance(value, type):
-            raise UserError(f"{path}: {field} is {value!r}; it must be a frozen dataclass's value.")
-    return Source(found, name, path)
+        missing = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
+        beside, hint = place.parent / missing.partition(".")[0], ""
+        if missing == "purerl":
+            of_run = (Path(file).parent / "config.json").exists()
+            hint = " The run was made by an older purerl: train it anew." if of_run else ""
+        elif missing and (beside.is_dir() or beside.with_suffix(".py").exists()):
+            hint = f"; it stands beside the file: set PYTHONPATH={place.parent}"
+        raise UserError(f"{file}{where}: {one_line(error)}{hint}") from error
 
 
 # --- settings as JSON ---
 
 
-def settings(experiment: Experiment) -> dict[str, Any]:
-    """Returns everything of an experiment but its builders, by field name."""
+def settings(value: Any) -> dict[str, Any]:
+    """Returns the fields of an experiment, or of a dataclass in it, but not its builders."""
     return {
-        field.name: getattr(experiment, field.name)
-        for field in dataclasses.fields(experiment)
-        if field.name not in BUILDERS
+        field.name: getattr(value, field.name)
+        for field in dataclasses.fields(value)
+        if field.init and field.name not in BUILDERS
     }
+
+
+def _has_settings(value: Any) -> bool:
+    return dataclasses.is_dataclass(value) and not isinstance(value, type)
 
 
 def to_json(value: Any, path: str = "") -> Any:
     """Turns settings into JSON values; UserError names a field that JSON cannot hold."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        value = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
-        value = {k: v for k, v in value.items() if k not in BUILDERS}
+    if _has_settings(value):
+        value = settings(value)
     if isinstance(value, enum.Enum):
         return value.name
     if isinstance(value, dict) and all(isinstance(key, str) for key in value):
-        return {key: to_json(v, f"{path}.{key}" if path else key) for key, v in value.items()}
+        return {key: to_json(v, _join(path, key)) for key, v in value.items()}
     if isinstance(value, tuple | list):
         return [to_json(v, f"{path}[{i}]") for i, v in enumerate(value)]
     if isinstance(value, Path):
@@ -259,10 +230,10 @@ def from_json(template: Any, values: Any, path: str = "") -> Any:
     Raises:
       UserError: a field is missing or unknown: the code is not the one that wrote the values.
     """
-    if dataclasses.is_dataclass(template) and not isinstance(template, type):
-        names = [f.name for f in dataclasses.fields(template) if f.init and f.name not in BUILDERS]
-        _check_names(names, values, path)
-        read = {n: from_json(getattr(template, n), values[n], _join(path, n)) for n in names}
+    if _has_settings(template):
+        known = settings(template)
+        _check_names(list(known), values, path)
+        read = {n: from_json(value, values[n], _join(path, n)) for n, value in known.items()}
         try:
             return dataclasses.replace(template, **read)
         except ValueError as error:
@@ -272,12 +243,12 @@ def from_json(template: Any, values: Any, path: str = "") -> Any:
     if isinstance(template, Path):
         return Path(values)
     if isinstance(values, dict):
-        known = template if isinstance(template, dict) else {}
-        return {k: from_json(known.get(k), v, _join(path, k)) for k, v in values.items()}
+        like = template if isinstance(template, dict) else {}
+        return {k: from_json(like.get(k), v, _join(path, k)) for k, v in values.items()}
     if isinstance(values, list):
-        like = list(template) if isinstance(template, list | tuple) and template else [None]
-        like += like[-1:] * (len(values) - len(like))  # what is longer goes on like the last
-        inner = [from_json(t, v, f"{path}[]") for t, v in zip(like, values, strict=False)]
+        first = list(template) if isinstance(template, list | tuple) and template else [None]
+        first += first[-1:] * (len(values) - len(first))  # what is longer goes on like the last
+        inner = [from_json(t, v, f"{path}[]") for t, v in zip(first, values, strict=False)]
         return inner if isinstance(template, list) else tuple(inner)
     return values
 
@@ -289,9 +260,8 @@ def _join(path: str, name: str) -> str:
 def _check_names(names: list[str], values: Any, path: str) -> None:
     if not isinstance(values, dict):
         raise UserError(f"The settings of {path} are {values!r}; they must be {{name: value}}.")
-    for name in sorted({*names, *values}):
-        if name not in values:
+    for name in sorted(set(names).symmetric_difference(values)):
+        if name in names:
             raise UserError(f"config.json lacks {_join(path, name)}, which the experiment has.")
-        if name not in names:
-            valid = [_join(path, n) for n in names]
-            raise UserError(unknown_name("setting", _join(path, name), valid))
+        valid = [_join(path, n) for n in names]
+        raise UserError(unknown_name("setting", _join(path, name), valid))

@@ -1,8 +1,6 @@
 """The files of runs: JSON, written whole or not at all, and which folders are runs. No JAX."""
 
-import argparse
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -29,20 +27,6 @@ def write_json(path: Path, value: dict[str, Any]) -> None:
 def draft_of(path: Path) -> Path:
     """Returns the file that holds what `path` will hold once it is whole."""
     return path.with_name(f".{path.name}.draft")
-
-
-def output_file(name: str) -> str:
-    """Checks the name of a file to write, "" for none; the `type` of an argument of argparse.
-
-    Raises:
-      argparse.ArgumentTypeError: it cannot be written, which is better known before measuring.
-    """
-    folder = Path(name).absolute().parent
-    if name and not os.access(folder, os.W_OK):
-        raise argparse.ArgumentTypeError(
-            f"{name} cannot be written: is {folder} a folder of yours?"
-        )
-    return name
 
 
 def runs_in(place: Path) -> list[Path]:

@@ -3,17 +3,14 @@
 import functools
 import json
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from purerl.core.errors import UserError, one_line
 
 if TYPE_CHECKING:
-    from purerl.core.env import Env
-    from purerl.core.records import Network, TrainState
-    from purerl.ppo.config import Config
     from purerl.runs import run_folder
-    from purerl.runs.experiment import Experiment
     from purerl.runs.policy import Policy
 
 
@@ -43,6 +40,11 @@ def load(folder: Path | str, checkpoint: str = "latest", engine: str = "") -> "R
     return Run(folder, str(checkpoint), engine)
 
 
+def _saved_as(name: str, doc: str) -> property:
+    """Returns a property: what the checkpoint says of itself by that name."""
+    return property(lambda self: self.restored.saved.meta[name], doc=doc)
+
+
 @dataclass(frozen=True)
 class Run:
     """A run read back; what it holds is built when it is first asked for."""
@@ -60,52 +62,24 @@ class Run:
         set_up_jax(cache=True)
         return restore(self.folder, self.checkpoint, print, self.engine)
 
-    @property
-    def experiment(self) -> "Experiment":
-        """The experiment, with the run's settings."""
-        return self.restored.experiment
-
-    @property
-    def config(self) -> "Config":
-        """The settings of PPO."""
-        return self.restored.setup.config
-
-    @property
-    def env(self) -> "Env":
-        """One environment."""
-        return self.restored.setup.env
-
-    @property
-    def network(self) -> "Network":
-        """The network's functions."""
-        return self.restored.setup.network
-
-    @property
-    def state(self) -> "TrainState":
-        """The checkpoint's state, without environments, episodes and optimizer."""
-        return self.restored.saved.state
-
-    @property
-    def update(self) -> int:
-        """Updates done."""
-        return self.restored.saved.meta["update"]
-
-    @property
-    def steps(self) -> int:
-        """Control steps taken, all environments together."""
-        return self.restored.saved.meta["steps"]
-
-    @property
-    def digest(self) -> str:
-        """The sha256 of the whole state that was saved."""
-        return self.restored.saved.meta["digest"]
-
     @functools.cached_property
     def policy(self) -> "Policy":
         """The policy, at the start of an episode."""
         from purerl.runs.policy import Policy
 
         return Policy(self.env, self.network, self.state)
+
+    experiment = property(attrgetter("restored.experiment"), doc="With the run's settings.")
+    config = property(attrgetter("restored.setup.config"), doc="The settings of PPO.")
+    env = property(attrgetter("restored.setup.env"), doc="One environment.")
+    network = property(attrgetter("restored.setup.network"), doc="The network's functions.")
+    state = property(
+        attrgetter("restored.saved.state"),
+        doc="The checkpoint's TrainState, without environments, episodes and optimizer.",
+    )
+    update = _saved_as("update", "Updates done.")
+    steps = _saved_as("steps", "Control steps taken, all environments together.")
+    digest = _saved_as("digest", "The sha256 of the whole state that was saved.")
 
     def metrics(self) -> dict[str, list[Any]]:
         """Returns metrics.jsonl as columns, None where a line lacks one; JAX is not needed.
@@ -143,30 +117,22 @@ class Run:
         def judge(state: Any, key: Any) -> dict[str, Any]:
             return evaluate(config, env, network, state, key, episodes, not stochastic)
 
+        def summarize(values: Any) -> dict[str, Any]:
+            values = np.asarray(values, float)
+            numbers = {f: float(getattr(values, f)()) for f in ("mean", "std", "min", "max")}
+            return numbers | {"values": values.tolist()}
+
         key = derive(jax.random.key(seed), Purpose.EVALUATION)
-        values = jax.device_get(jax.jit(judge)(self.state, key))
+        found = jax.device_get(jax.jit(judge)(self.state, key))
         return {
             "run": str(self.folder),
-            "update": self.update,
-            "steps": self.steps,
-            "digest": self.digest,
+            **{name: getattr(self, name) for name in ("update", "steps", "digest")},
             "engine": engine,
             "seed": seed,
             "policy": "stochastic" if stochastic else "deterministic",
             "episodes": episodes,
-            "metrics": {n: statistics(np.asarray(x, float)) for n, x in sorted(values.items())},
+            "metrics": {name: summarize(values) for name, values in sorted(found.items())},
         }
-
-
-def statistics(values: Any) -> dict[str, Any]:
-    """Summarises one metric of all episodes, [N]; std is over the episodes (divided by N)."""
-    return {
-        "mean": float(values.mean()),
-        "std": float(values.std()),
-        "min": float(values.min()),
-        "max": float(values.max()),
-        "values": values.tolist(),
-    }
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:

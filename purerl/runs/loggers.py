@@ -1,10 +1,10 @@
 """What a run tells: metrics.jsonl, which is part of the run, and loggers, which are not.
 
 metrics.jsonl is exact: it holds the same lines whether the run was resumed or not. TensorBoard and
-W&B have threads of their own. Training never waits for them: a logger that raises an error, or
-cannot keep up, is dropped with one message.
+W&B have threads of their own, for which training never waits.
 """
 
+import importlib.util
 import json
 import math
 import queue
@@ -14,12 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import UserError, one_line
+from purerl.runs.files import read_json
+from purerl.runs.options import Options
 
 Record = dict[str, Any]
 Say = Callable[[str], None]
 
 MAX_SKIPPED_IN_A_ROW = 10  # minibatches; a run that skips so many cannot go on
-COUNTS = ("episodes", "nonfinite_resets", "replayed_resets", "reused_resets", "skipped_minibatches")
+COUNTS = ("episodes", "nonfinite_resets", "replayed_resets", "skipped_minibatches")
 
 
 def summarize(window: Sequence[Mapping[str, Any]]) -> Record:
@@ -28,7 +30,7 @@ def summarize(window: Sequence[Mapping[str, Any]]) -> Record:
     Metrics of episodes that ended (`episode...`) are averaged over the episodes, not over the
     updates. They are None if no episode ended.
     """
-    episodes = sum(float(metrics["episodes"]) for metrics in window)
+    counts = [float(metrics["episodes"]) for metrics in window]
     record: Record = {}
     for name in window[0]:
         values = [float(metrics[name]) for metrics in window]
@@ -38,9 +40,8 @@ def summarize(window: Sequence[Mapping[str, Any]]) -> Record:
             record[name] = values[-1]
         elif name.startswith("episode"):
             # An update without an ended episode has nothing to say: not 0, and not NaN.
-            counts = [float(metrics["episodes"]) for metrics in window]
             weighted = sum(v * n for v, n in zip(values, counts, strict=True) if n)
-            record[name] = weighted / episodes if episodes else None
+            record[name] = weighted / sum(counts) if sum(counts) else None
         else:
             record[name] = sum(values) / len(values)
     return record
@@ -81,15 +82,11 @@ class MetricsFile:
         self.pending = b""
         return self.offset
 
-    def close(self) -> None:
-        """Closes the file."""
-        self.file.close()
-
 
 class BackgroundLogger:
-    """A sink in a thread of its own; dropped, with one message, when it raises or lags.
+    """A sink (`log(record)`, `close()`) in a thread of its own.
 
-    A sink is what has `log(record)` and `close()`.
+    It is dropped, with one message, when it raises or lags.
     """
 
     def __init__(self, name: str, open_sink: Callable[[], Any], say: Say, size: int = 256) -> None:
@@ -137,56 +134,62 @@ class BackgroundLogger:
             self.say(f"The {self.name} logger is dropped: {reason}. Training goes on.")
 
 
-class TensorBoardSink:
-    """Writes scalars for TensorBoard under the run's folder."""
+class _TensorBoardSink:
+    """Writes scalars for TensorBoard; what an earlier life wrote after `update` is hidden."""
 
     def __init__(self, folder: Path, update: int) -> None:
-        """Opens a writer that hides what an earlier life of the run wrote after `update`."""
         from tensorboardX import SummaryWriter
 
         self.writer = SummaryWriter(str(folder / "tensorboard"), purge_step=update + 1)
+        self.close = self.writer.close
 
     def log(self, record: Record) -> None:
-        """Writes every number of a record, at its update."""
         for name, value in record.items():
             if isinstance(value, float) and math.isfinite(value):
                 self.writer.add_scalar(name, value, record["update"])
 
-    def close(self) -> None:
-        """Flushes and closes."""
-        self.writer.close()
 
-
-class WandbSink:
+class _WandbSink:
     """Sends records to Weights & Biases; a resumed run goes on under the same id."""
 
-    def __init__(self, folder: Path, mode: Any, project: str, run_id: str, config: Record) -> None:
-        """Starts or continues the W&B run; its files go under the run's folder."""
+    def __init__(self, folder: Path, mode: Any, project: str) -> None:
         import wandb
 
-        name = "/".join(folder.absolute().parts[-2:])
         self.run = wandb.init(
-            project=project, id=run_id, resume="allow", mode=mode, dir=str(folder), name=name,
-            config=config, settings=wandb.Settings(console="off"),
+            project=project, id=read_json(folder / "manifest.json")["run_id"], resume="allow",
+            mode=mode, dir=str(folder), name="/".join(folder.absolute().parts[-2:]),
+            config=read_json(folder / "config.json"), settings=wandb.Settings(console="off"),
             reinit="create_new",  # several seeds in one process are several W&B runs
         )  # fmt: skip
         self.run.define_metric("update")
         self.run.define_metric("*", step_metric="update")
-
-    def log(self, record: Record) -> None:
-        """Sends one record."""
-        self.run.log(record)
-
-    def close(self) -> None:
-        """Finishes the upload."""
-        self.run.finish()
+        self.log, self.close = self.run.log, self.run.finish
 
 
-def check_installed(package: str, extra: str) -> None:
-    """Raises UserError, with the line to paste, unless a logger's package is there."""
-    import importlib.util
+def check_loggers(options: Options) -> None:
+    """Raises UserError, with the line to paste, unless the packages of loggers are there."""
+    asked = {"tensorboardX": options.tensorboard, "wandb": options.wandb != "off"}
+    for package, wanted in asked.items():
+        if wanted and importlib.util.find_spec(package) is None:
+            raise UserError(
+                f"The package {package} is not installed; "
+                f"run: pip install 'purerl[{package.removesuffix('X')}]'"
+            )
 
-    if importlib.util.find_spec(package) is None:
-        raise UserError(
-            f"The package {package} is not installed; run: pip install 'purerl[{extra}]'"
-        )
+
+def open_loggers(options: Options, folder: Path, update: int, say: Say) -> list[BackgroundLogger]:
+    """Starts the loggers asked for.
+
+    Args:
+      options: the run's options.
+      folder: the run.
+      update: where it goes on; what TensorBoard has after it is hidden.
+      say: told of a logger that is dropped.
+    """
+    found = []
+    if options.tensorboard:
+        found.append(BackgroundLogger("TensorBoard", lambda: _TensorBoardSink(folder, update), say))
+    if options.wandb != "off":
+        mode, project = options.wandb, options.wandb_project
+        found.append(BackgroundLogger("W&B", lambda: _WandbSink(folder, mode, project), say))
+    return found

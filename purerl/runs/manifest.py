@@ -1,8 +1,6 @@
 """The manifest: all that a run's bits depend on besides its settings.
 
-That is: versions, device, flags, source. The same settings give the same bits only under the same
-manifest. So a run writes it down at the start, `--resume` compares it, and every checkpoint holds
-its fingerprint.
+A run writes it down at the start, `--resume` compares it, and checkpoints hold its fingerprint.
 """
 
 import hashlib
@@ -21,8 +19,8 @@ PACKAGES = ["jax", "jaxlib", "mujoco", "mujoco-mjx", "dm-control", "flax", "opta
 PACKAGES += ["orbax-checkpoint"]
 INFORMATIVE = {"run_id", "name", "git_revision", "git_dirty", "allowed_changes"}
 INFORMATIVE |= {"devices"}  # how many share the shards
-INFORMATIVE |= {"experiment_file"}  # its text is compared itself
-INFORMATIVE |= {"bit_exact", "inexact_because"}  # what they follow from is compared itself
+# What these follow from is compared itself.
+INFORMATIVE |= {"experiment_file", "bit_exact", "inexact_because"}
 FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE", "JAX_PLATFORMS", "JAX_ENABLE_X64")
 
 
@@ -32,9 +30,9 @@ def collect(
     """Describes this process: all that decides a run's bits apart from the run's own settings.
 
     Args:
-      engine: the physics engine in use, resolved ("auto" is not an answer).
+      engine: the physics engine in use, never "auto".
       builders: functions whose source is part of the run (build_env, build_network).
-      kernels: `xla_flags.how_chosen`.
+      kernels: `exact.how_chosen`.
       num_shards: V. How many devices share the shards changes no bit.
     """
     import jax
@@ -57,20 +55,20 @@ def collect(
             "x64": options["jax_enable_x64"],
             "prng": options["jax_default_prng_impl"],
             "threefry_partitionable": options["jax_threefry_partitionable"],
-            "flags": flags(),
+            "flags": _flags(),
             "source": source_hashes(builders),
         }
-        | exactness(inexact_because(engine, kernels))
+        | exactness(engine, kernels)
         | _git(Path(__file__).parent)
     )
 
 
-def inexact_because(engine: str, kernels: str, unordered: Iterable[str] = ()) -> list[str]:
-    """Lists what keeps two runs of one manifest from having the same bits; empty: nothing does.
+def exactness(engine: str, kernels: str, unordered: Iterable[str] = ()) -> dict[str, Any]:
+    """Returns what manifest.json says of a run's exactness, and of what prevents it.
 
     Args:
       engine: the physics engine.
-      kernels: `xla_flags.how_chosen`.
+      kernels: `exact.how_chosen`.
       unordered: places of sums, in a program for a GPU, whose order nothing fixes.
     """
     reasons = [f"a sum without a fixed order: {place}" for place in unordered]
@@ -81,15 +79,10 @@ def inexact_because(engine: str, kernels: str, unordered: Iterable[str] = ()) ->
             "XLA chooses kernels by timing, anew in each process: leave xla_gpu_autotune_level out "
             "of XLA_FLAGS, or set it to 0"
         )
-    return reasons
-
-
-def exactness(reasons: list[str]) -> dict[str, Any]:
-    """Returns what manifest.json says of a run's exactness."""
     return {"bit_exact": not reasons, "inexact_because": reasons}
 
 
-def flags() -> dict[str, str]:
+def _flags() -> dict[str, str]:
     """Returns the environment variables that bits depend on, without what says how many devices."""
     found = {name: os.environ[name] for name in FLAGS if name in os.environ}
     if "XLA_FLAGS" in found:
@@ -113,15 +106,11 @@ def fingerprint(manifest: dict[str, Any]) -> str:
 def differences(old: Any, new: Any, path: str = "") -> list[str]:
     """Lists where two JSON values differ, as `path: old -> new`, but for INFORMATIVE keys."""
     if isinstance(old, dict) and isinstance(new, dict):
-        keys = [key for key in sorted({*old, *new}) if path or key not in INFORMATIVE]
-        missing = "(absent)"
-        return [
-            line
-            for key in keys
-            for line in differences(
-                old.get(key, missing), new.get(key, missing), f"{path}.{key}" if path else key
-            )
-        ]
+        found = []
+        for key in sorted({*old, *new} - (set() if path else INFORMATIVE)):
+            values = (old.get(key, "(absent)"), new.get(key, "(absent)"))
+            found += differences(*values, f"{path}.{key}" if path else key)
+        return found
     return [] if old == new else [f"{path}: {old} -> {new}"]
 
 
@@ -136,10 +125,7 @@ def _device_kind(device: Any) -> str:
     """Returns the device's model; for a CPU the processor's, since kernels are chosen by it."""
     if device.platform != "cpu":
         return device.device_kind
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.machine()
 

@@ -57,16 +57,19 @@ class Options:
     wandb_project: str = "purerl"
     """The W&B project."""
     video: bool = False
-    """Make a video at each evaluation, in a process of low priority (see purerl.render)."""
+    """When training has ended, make a video of the policy, as `python -m purerl.render` does."""
     cache: bool = True
     """Whether compiled programs are kept, in JAX_COMPILATION_CACHE_DIR, else in purerl/jax in
     XDG_CACHE_HOME or ~/.cache."""
 
     def __post_init__(self) -> None:
         """Checks the rules."""
-        for name, least in _LEAST.items():
+        lowest = {"num_seeds": 1, "num_shards": 0, "log_every": 0, "checkpoints": 0, "keep": 1}
+        for name, least in lowest.items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}.")
 
-
-_LEAST = {"num_seeds": 1, "num_shards": 0, "log_every": 0, "checkpoints": 0, "keep": 1}
+    @property
+    def vmapped_seeds(self) -> int:
+        """How many seeds share one program; 1 if each is trained by itself."""
+        return self.num_seeds if self.seeds_by == "vmap" else 1

@@ -65,7 +65,7 @@ class Policy:
           UserError: the observation has another shape, or another number of environments than
             the memory.
         """
-        batch, flat = flatten(observation, self._example)
+        batch, flat = _flatten(observation, self._example)
         if self._memory is None:
             self._memory, self._batch = start_memory(self._state.carry, math.prod(batch)), batch
         elif batch != self._batch and jax.tree.leaves(self._memory):
@@ -77,13 +77,8 @@ class Policy:
         return np.asarray(action).reshape(*batch, action.shape[-1])
 
 
-def flatten(observation: Any, example: PyTree) -> tuple[tuple[int, ...], PyTree]:
-    """Returns an observation's leading axes, and its leaves with one axis in their place.
-
-    Args:
-      observation: leaves [..., O].
-      example: the shapes of one environment's, leaves [O].
-    """
+def _flatten(observation: Any, example: PyTree) -> tuple[tuple[int, ...], PyTree]:
+    """Returns the leading axes of leaves [..., O], and the leaves as [B, O]; `example` has [O]."""
     try:
         arrays = jax.tree.map(lambda _, x: np.asarray(x, np.float32), example, observation)
     except (TypeError, ValueError):
@@ -91,12 +86,9 @@ def flatten(observation: Any, example: PyTree) -> tuple[tuple[int, ...], PyTree]
     pairs = list(zip(jax.tree.leaves(arrays), jax.tree.leaves(example), strict=False))
     batches = {x.shape[: max(x.ndim - one.ndim, 0)] for x, one in pairs}
     if len(batches) != 1 or any(x.shape[-one.ndim :] != one.shape for x, one in pairs):
-        is_list = lambda x: isinstance(x, list)  # noqa: E731
-        given = jax.tree.map(np.shape, observation, is_leaf=is_list)
-        wanted = jax.tree.map(np.shape, example)
+        given = jax.tree.map(np.shape, observation, is_leaf=lambda x: isinstance(x, list))
         raise UserError(
-            f"The observation's shape is {given}; it must be {wanted}, with the same leading axes "
-            "everywhere for several environments."
+            f"The observation's shape is {given}; it must be {jax.tree.map(np.shape, example)}, "
+            "with the same leading axes everywhere for several environments."
         )
-    flat = jax.tree.map(lambda x, one: x.reshape(-1, *one.shape), arrays, example)
-    return batches.pop(), flat
+    return batches.pop(), jax.tree.map(lambda x, one: x.reshape(-1, *one.shape), arrays, example)

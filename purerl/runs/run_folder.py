@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 from purerl.core.errors import UserError
-from purerl.core.records import TrainState
+from purerl.core.records import PyTree, TrainState
 from purerl.devices.programs import abstract_state
 from purerl.runs import checkpoint, checkpoint_folder, experiment, manifest
 from purerl.runs.build_experiment import Setup, build, physics_hash
@@ -21,6 +21,7 @@ from purerl.runs.source_hashes import module_file, source_hashes
 
 LOCK = ".lock"
 OURS = {LOCK, "config.json", "manifest.json", "experiment.py", "metrics.jsonl", "checkpoints"}
+MANY = 9  # edited files, which a refusal to resume then counts and does not list
 
 
 class RestoredRun(NamedTuple):
@@ -29,16 +30,15 @@ class RestoredRun(NamedTuple):
     experiment: Experiment
     setup: Setup
     saved: checkpoint.Saved
-    settings: dict[str, Any]  # config.json
+
+
+# --- beginning, and going on ---
 
 
 def lock(folder: Path) -> IO[str]:
     """Makes the folder and locks it for this process, until the process ends in whatever way."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle = (folder / LOCK).open("a+")
-    except OSError as error:
-        raise UserError(f"The folder {folder} cannot be written: {error.strerror}.") from error
+    folder.mkdir(parents=True, exist_ok=True)
+    handle = (folder / LOCK).open("a+")
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
@@ -49,8 +49,7 @@ def lock(folder: Path) -> IO[str]:
             "another --name."
         ) from error
     handle.truncate(0)
-    handle.write(str(os.getpid()))
-    handle.flush()
+    print(os.getpid(), file=handle, flush=True)
     return handle
 
 
@@ -86,7 +85,7 @@ def check_new_or_resume(folders: Iterable[Path], resume: bool) -> None:
 
 def describe(source: Source, chosen: Experiment, schedule: dict[str, Any]) -> dict[str, Any]:
     """Returns config.json: every setting of the run; UserError if one cannot be read back."""
-    settings = experiment.to_json(experiment.settings(chosen))
+    settings = experiment.to_json(chosen)
     rebuilt = experiment.from_json(source.experiment, settings)
     for name, value in experiment.settings(chosen).items():
         if (read := getattr(rebuilt, name)) != value:
@@ -97,62 +96,81 @@ def describe(source: Source, chosen: Experiment, schedule: dict[str, Any]) -> di
     return {"experiment": source.name, "settings": settings, "schedule": schedule}
 
 
-def start(folder: Path, source: Source, settings: dict[str, Any], facts: dict[str, Any]) -> None:
-    """Writes the three files that describe a new run; config.json last, it makes it a run."""
-    shutil.copyfile(source.path, folder / "experiment.py")
-    write_json(folder / "manifest.json", identity(folder) | facts)
-    write_json(folder / "config.json", settings)
-
-
-def identity(folder: Path) -> dict[str, str]:
-    """Returns what tells a new run from all others: a random id, and the folder's name."""
-    return {"run_id": uuid.uuid4().hex[:12], "name": folder.name}
-
-
-def check_same(
-    folder: Path, source: Source, settings: dict[str, Any], facts: dict[str, Any]
-) -> list[str]:
-    """Lists how this process differs from the one that began the run.
+def begin_or_go_on(
+    folder: Path,
+    source: Source,
+    settings: dict[str, Any],
+    facts: dict[str, Any],
+    abstract: PyTree,
+    allow_changes: bool,
+) -> None:
+    """Writes down what a new run is, or checks that this process would continue the old one.
 
     Args:
       folder: the run.
       source: the experiment as it is now.
       settings: what config.json would say now.
       facts: what manifest.json would say now.
-
-    Returns:
-      A line for each difference; none: the run goes on exactly.
+      abstract: shapes of the state.
+      allow_changes: whether to go on, and note it, where the old run would not go on exactly.
     """
+    if not (folder / "config.json").exists():
+        _write(folder, source, settings, _identity(folder) | facts)
+        return
+    old = read_json(folder / "manifest.json")
     found = manifest.differences(read_json(folder / "config.json"), settings)
-    found += manifest.differences(read_json(folder / "manifest.json"), facts)
+    found += manifest.differences(old, facts)
     if (folder / "experiment.py").read_bytes() != source.path.read_bytes():
         found.append(f"experiment.py: {source.path} has been edited")
-    return found
+    if found and not allow_changes:
+        raise UserError(
+            f"The run {folder} was begun under other conditions, so it would not go on exactly:\n  "
+            + "\n  ".join(_shortened(found))
+            + "\nGive the command it was begun with, train anew under another --name, or go on all "
+            "the same with --allow-changes."
+        )
+    if found:
+        checkpoint.check_fits(folder / "checkpoints", abstract)
+        _write(folder, source, settings, facts | _noted(folder, old, found))
 
 
-def accept_changes(
-    folder: Path, source: Source, settings: dict[str, Any], facts: dict[str, Any], found: list[str]
-) -> None:
-    """Writes down after which update the run goes on under other conditions, and which.
-
-    A copy under another name gets a run_id of its own: loggers must not take it for the first run.
-    """
-    old = read_json(folder / "manifest.json")
-    known = {"run_id": old.get("run_id", ""), "name": old.get("name", folder.name)}
-    after = max(checkpoint_folder.updates(folder / "checkpoints"), default=0)
-    entry: dict[str, Any] = {"after_update": after, "changes": found}
-    if known["name"] != folder.name:
-        entry, known = {"of": known} | entry, identity(folder)
-    kept = known | {"allowed_changes": [*old.get("allowed_changes", []), entry]}
+def _write(folder: Path, source: Source, settings: dict[str, Any], facts: dict[str, Any]) -> None:
+    """Writes the three files that describe a run; config.json last, it makes it a run."""
     shutil.copyfile(source.path, folder / "experiment.py")
-    write_json(folder / "manifest.json", facts | kept)
+    write_json(folder / "manifest.json", facts)
     write_json(folder / "config.json", settings)
 
 
-def amend(folder: Path, facts: dict[str, Any]) -> None:
-    """Adds to manifest.json what is known only when the programs are compiled."""
-    path = folder / "manifest.json"
-    write_json(path, read_json(path) | facts)
+def _identity(folder: Path) -> dict[str, str]:
+    """Returns what tells a new run from all others: a random id, and the folder's name."""
+    return {"run_id": uuid.uuid4().hex[:12], "name": folder.name}
+
+
+def _shortened(found: list[str]) -> list[str]:
+    """Returns differences for a person: many edited files as a number, and what to do for NPROC."""
+    pin = "device.threads"  # a CPU's bits depend on the size of XLA's thread pool
+    threads = [line.split()[1] for line in found if line.startswith(pin)]
+    edited = [line for line in found if line.startswith("source.")]
+    if len(edited) > MANY:
+        found = [line for line in found if line not in edited]
+        found.append(f"source: {len(edited)} files, as of another version of purerl")
+    return found + [f"(NPROC={number} brings {pin} back)" for number in threads]
+
+
+def _noted(folder: Path, old: dict[str, Any], found: list[str]) -> dict[str, Any]:
+    """Returns what manifest.json says of a run that goes on under other conditions.
+
+    A copy under another name gets a run_id of its own: loggers must not take it for the first run.
+    """
+    known = {name: old[name] for name in ("run_id", "name")}
+    after = max(checkpoint_folder.updates(folder / "checkpoints"), default=0)
+    entry: dict[str, Any] = {"after_update": after, "changes": found}
+    if known["name"] != folder.name:
+        entry, known = {"of": known} | entry, _identity(folder)
+    return known | {"allowed_changes": [*old.get("allowed_changes", []), entry]}
+
+
+# --- reading back ---
 
 
 def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> RestoredRun:
@@ -169,21 +187,20 @@ def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> Rest
     """
     folder = Path(folder)
     check_is_run(folder)
-    settings = read_json(folder / "config.json")
+    config = read_json(folder / "config.json")
     begun = read_json(folder / "manifest.json")
-    original = Path(begun["experiment_file"]) if "experiment_file" in begun else None
-    source = experiment.load(folder / "experiment.py", settings["experiment"], original)
-    filled = fill(settings["settings"], experiment.to_json(source.experiment), say)
-    chosen = experiment.from_json(source.experiment, filled)
-    if engine:
-        chosen = experiment.from_json(chosen, experiment.to_json(chosen) | {"engine": engine})
+    original = Path(begun["experiment_file"])
+    source = experiment.load(folder / "experiment.py", config["experiment"], original)
+    settings = _fill(config["settings"], experiment.to_json(source.experiment), say)
+    chosen = experiment.from_json(
+        source.experiment, settings | ({"engine": engine} if engine else {})
+    )
     setup = build(chosen)
-    for what in changed_since(begun, source, setup):
+    for what in _changed_since(begun, source, setup):
         say(f"{what} is not that of the run any more.")
     abstract = abstract_state(*setup[:3])
     abstract = abstract.replace(env=None, episode=None, optimizer=None)
-    saved = _choose(folder / "checkpoints", update, abstract, say)
-    return RestoredRun(chosen, setup, saved, settings)
+    return RestoredRun(chosen, setup, _choose(folder / "checkpoints", update, abstract, say))
 
 
 def check_is_run(folder: Path) -> None:
@@ -195,38 +212,31 @@ def check_is_run(folder: Path) -> None:
         raise UserError(f"{folder} is {what}.{runs}")
 
 
-def changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[str]:
-    """Lists what has changed since the run began and may change what its policy does.
-
-    Args:
-      begun: the run's manifest.json.
-      source: the run's own copy of its experiment, which cannot have been edited.
-      setup: what it builds now.
-    """
+def _changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[str]:
+    """Lists what has changed since the run began and may change what its policy does."""
     builders = (source.experiment.build_env, source.experiment.build_network)
-    then, now = begun.get("source"), source_hashes(builders)
-    then = then if isinstance(then, dict) else {}
+    now, then = source_hashes(builders), begun["source"]
     edited = [name for name, value in now.items() if then.get(name) != value]
+    # The run's own copy of its experiment, `source`, cannot have been edited.
     edited = [name for name in edited if module_file(name) != source.path]
     few = ", ".join(edited[:3]) + (f" and {len(edited) - 3} more" if len(edited) > 3 else "")
     found = [f"The code of {few}"] if edited else []
-    model = physics_hash(setup.env)
-    if setup.engine == begun.get("engine") and model != begun.get("model", model):
+    if setup.engine == begun["engine"] and physics_hash(setup.env) != begun["model"]:
         found.append("MuJoCo's model")
     return found
 
 
-def fill(old: Any, new: Any, say: Say, path: str = "") -> Any:
+def _fill(old: Any, new: Any, say: Say, path: str = "") -> Any:
     """Returns the settings `old` of a run, and from `new` those that the code got since then."""
     if not (isinstance(old, dict) and isinstance(new, dict)):
         return old
     for name in new.keys() - old.keys():
         say(f"config.json lacks {path}{name}; it is taken as {new[name]}.")
-    return new | {name: fill(old[name], new.get(name), say, f"{path}{name}.") for name in old}
+    return new | {name: _fill(old[name], new.get(name), say, f"{path}{name}.") for name in old}
 
 
 def _choose(folder: Path, update: str, abstract: TrainState, say: Say) -> checkpoint.Saved:
-    found = checkpoint_folder.updates(folder)
+    """Reads the checkpoint that was asked for; see `restore`."""
     if update == "latest":
         whole = checkpoint.newest([folder], abstract, say, rename=False)
         if not whole:
@@ -235,8 +245,9 @@ def _choose(folder: Path, update: str, abstract: TrainState, say: Say) -> checkp
     number = checkpoint_folder.best_update(folder) if update == "best" else update
     if number is None:
         raise UserError(f"No checkpoint in {folder} was taken at an evaluation; try latest.")
-    if str(number) not in map(str, found):
-        valid = ", ".join(["latest", "best", *map(str, found)])
+    found = list(map(str, checkpoint_folder.updates(folder)))
+    if str(number) not in found:
+        valid = ", ".join(["latest", "best", *found])
         raise UserError(f"There is no checkpoint {update!r} in {folder}. Valid: {valid}.")
     try:
         return checkpoint.load(checkpoint_folder.path_of(folder, int(number)), abstract)

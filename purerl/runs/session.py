@@ -1,22 +1,25 @@
-"""Carries a run command out: prepares folders and programs, and has each seed trained.
+"""Carries a run command out: prepares folders and programs, and trains each seed.
 
 A seed's folder is a run like any other. Seeds mapped one after another are runs one after another,
 with the same compiled programs: their bits are those of single runs by construction. Vmapped seeds
-share one program, whose bits depend on their number (`seeds.py`).
+share one program, whose bits depend on their number. They are saved and resumed together, always at
+an update that all of them have on the disk.
 """
 
 import functools
 import sys
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from purerl import exact
 from purerl.core.errors import RunError, UserError
-from purerl.core.records import PyTree
+from purerl.core.records import PyTree, TrainState
 from purerl.devices import compilation, processes
 from purerl.devices.check_sizes import check_minibatches, check_shards
 from purerl.devices.processes import alone
@@ -34,21 +37,25 @@ from purerl.runs import (
     run_folder,
 )
 from purerl.runs.experiment import Experiment, Source
-from purerl.runs.files import read_json
-from purerl.runs.seed_group import needed_loggers, train_together
+from purerl.runs.files import read_json, write_json
+from purerl.runs.loggers import Say, check_loggers, open_loggers
+from purerl.runs.options import Options
+from purerl.runs.writer import RunWriter
 
-if TYPE_CHECKING:
-    from purerl.runs.options import Options
 
-MANY = 9  # edited files, which a refusal to resume then counts and does not list
+class _Job(NamedTuple):
+    """What the seeds of one command have in common."""
+
+    options: Options
+    plan: loop.Plan
+    programs: Callable[[], Programs]  # compiles them when it is first called
+    abstract: PyTree  # shapes of one seed's state
+    facts: dict[str, Any]  # of manifest.json
+    stop: Callable[[], bool]  # tells whether a signal asked to stop
 
 
 def execute(
-    source: Source,
-    runs: dict[Path, Experiment],
-    options: "Options",
-    stop: Callable[[], bool],
-    stack: ExitStack,
+    source: Source, runs: dict[Path, Experiment], options: Options, stop: Callable[[], bool]
 ) -> None:
     """Prepares the folders and the programs, and trains.
 
@@ -57,93 +64,80 @@ def execute(
       runs: each seed's folder, and the experiment with its overrides.
       options: the run's options.
       stop: tells whether a signal asked to stop.
-      stack: closes what is opened here.
     """
-    chosen, vmapped = next(iter(runs.values())), vmapped_seeds(options)
-    processes.start(options.distributed)
-    alone(lambda: run_folder.check_new_or_resume(runs, options.resume))
-    loggers = needed_loggers(options)
-    cache = compilation.set_up_jax(options.cache)
-    with compilation.no_collection():
-        setup = build_experiment.build(chosen)
-        abstract = abstract_state(*setup[:3])
-    begun_with = alone(lambda: shards_on_disk(runs))
-    shards = choose_shards(setup.config, abstract, options, begun_with)
-    plan = loop.make_plan(setup.config, chosen.evaluation, options.checkpoints, options.log_every)
-    schedule = {"log_every": plan.log_every, "checkpoints": options.checkpoints}
-    facts = describe_process(chosen, setup, shards, vmapped)
-    facts["experiment_file"] = str(source.path)
+    chosen = next(iter(runs.values()))
+    with processes.fail_together(), ExitStack() as stack:
+        processes.start(options.distributed)
+        alone(lambda: run_folder.check_new_or_resume(runs, options.resume))
+        check_loggers(options)
+        cache = compilation.set_up_jax(options.cache)
+        with compilation.no_collection():
+            setup = build_experiment.build(chosen)
+            abstract = abstract_state(*setup[:3])
+        begun_with = alone(lambda: _shards_on_disk(runs))
+        shards = _choose_shards(setup.config, abstract, options, begun_with)
+        plan = loop.make_plan(
+            setup.config, chosen.evaluation, options.checkpoints, options.log_every
+        )
+        schedule = {"log_every": plan.log_every, "checkpoints": options.checkpoints}
+        builders = (chosen.build_env, chosen.build_network)
+        kernels = exact.how_chosen(jax.default_backend())
+        facts = manifest.collect(setup.engine, builders, kernels, shards.number)
+        facts["model"] = build_experiment.physics_hash(setup.env)
+        facts["experiment_file"] = str(source.path)
+        if options.vmapped_seeds > 1:
+            facts["vmapped_seeds"] = {"first": chosen.seed, "number": options.vmapped_seeds}
 
-    def prepare() -> bool:
-        for folder in runs:
-            stack.enter_context(run_folder.lock(folder))
-        run_folder.check_new_or_resume(runs, options.resume)  # again: another may have been here
-        for folder, one in runs.items():
-            settings = run_folder.describe(source, one, schedule)
-            begin_or_go_on(folder, source, settings, facts, abstract, options.allow_changes)
-        lines = console.describe_plan(plan, setup, abstract, facts, list(runs), cache)
-        print("\n".join(lines), flush=True)
-        return not all(checkpoint_folder.updates(folder / "checkpoints") for folder in runs)
+        @run_folder.refusals()
+        def prepare() -> bool:
+            for folder in runs:
+                stack.enter_context(run_folder.lock(folder))
+            run_folder.check_new_or_resume(runs, options.resume)  # another may have been here
+            for folder, one in runs.items():
+                settings = run_folder.describe(source, one, schedule)
+                run_folder.begin_or_go_on(
+                    folder, source, settings, facts, abstract, options.allow_changes
+                )
+            lines = console.describe_plan(plan, setup, abstract, facts, list(runs), cache)
+            print("\n".join(lines), flush=True)
+            return not all(checkpoint_folder.updates(folder / "checkpoints") for folder in runs)
 
-    with run_folder.refusals():
         fresh = alone(prepare)
 
-    @functools.cache
-    def programs() -> Programs:
-        calls_host = setup.engine == "c"
-        with build_experiment.blame(setup.env):
-            made = compile_programs(
-                *setup[:3], chosen.evaluation, fresh, shards, vmapped, calls_host
-            )
-        if jax.default_backend() == "gpu" and processes.is_first():
-            reasons = manifest.inexact_because(setup.engine, facts["kernels"], made.unordered)
-            for folder in runs:
-                run_folder.amend(folder, manifest.exactness(reasons))
-            for place in made.unordered:
-                print(f"Not bit-exact: nothing fixes the order of the sum {place}", flush=True)
-        return made
+        @functools.cache
+        def programs() -> Programs:
+            with build_experiment.blame(setup.env):
+                made = compile_programs(
+                    *setup[:3], chosen.evaluation, fresh, shards, options.vmapped_seeds,
+                    calls_host=setup.engine == "c",
+                )  # fmt: skip
+            if jax.default_backend() == "gpu" and processes.is_first():
+                exactness = manifest.exactness(setup.engine, kernels, made.unordered)
+                _tell_unordered(runs, exactness, made.unordered)
+            return made
 
-    groups = [list(runs)] if vmapped > 1 else [[folder] for folder in runs]
-    failed = []
-    for folders in groups:
-        seeds = [runs[folder].seed for folder in folders]
-        try:
-            train_together(folders, seeds, plan, programs, abstract, facts, options, loggers, stop)
-        except RunError as error:  # the seeds after it can still be trained
-            failed.append(str(error))
-            if len(groups) > 1:  # they may take long, or be stopped
-                print(f"purerl: {error}", file=sys.stderr, flush=True)
-    if failed:
-        raise RunError(" ".join(failed))
+        _train_all(runs, _Job(options, plan, programs, abstract, facts, stop))
 
 
-def describe_process(
-    chosen: Experiment, setup: build_experiment.Setup, shards: Shards, vmapped: int
-) -> dict[str, Any]:
-    """Returns what the bits depend on besides the settings, as the manifest keeps it."""
-    builders = (chosen.build_env, chosen.build_network)
-    chosen_by = exact.how_chosen(jax.default_backend())
-    facts = manifest.collect(setup.engine, builders, chosen_by, shards.number)
-    facts["model"] = build_experiment.physics_hash(setup.env)
-    if vmapped > 1:
-        facts["vmapped_seeds"] = {"first": chosen.seed, "number": vmapped}
-    return facts
+def _tell_unordered(folders: Iterable[Path], exactness: dict[str, Any], places: list[str]) -> None:
+    """Adds to manifest.json, and prints, what is known only when programs are compiled."""
+    for folder in folders:
+        path = folder / "manifest.json"
+        write_json(path, read_json(path) | exactness)
+    for place in places:
+        print(f"Not bit-exact: nothing fixes the order of the sum {place}", flush=True)
 
 
-def shards_on_disk(folders: Iterable[Path]) -> int:
+def _shards_on_disk(folders: Iterable[Path]) -> int:
     """Returns how many shards a run was begun with, 0 if there is none yet."""
     begun = [folder for folder in folders if (folder / "config.json").exists()]
-    return read_json(begun[0] / "manifest.json").get("num_shards", 1) if begun else 0
+    return read_json(begun[0] / "manifest.json")["num_shards"] if begun else 0
 
 
-def choose_shards(config: Config, abstract: PyTree, options: "Options", begun_with: int) -> Shards:
-    """Returns the shards asked for, or those of the run that goes on, or one for each device.
-
-    Raises:
-      UserError: devices, shards, environments and minibatches do not divide as they must.
-    """
+def _choose_shards(config: Config, abstract: PyTree, options: Options, begun_with: int) -> Shards:
+    """Returns the shards asked for, or those of the run that goes on, or one for each device."""
     number, devices = options.num_shards or begun_with, jax.device_count()
-    if vmapped_seeds(options) > 1:
+    if options.vmapped_seeds > 1:
         if number > 1:
             raise UserError(
                 f"num_shards is {number}, and {options.num_seeds} vmapped seeds share one program "
@@ -167,38 +161,95 @@ def choose_shards(config: Config, abstract: PyTree, options: "Options", begun_wi
     return shards
 
 
-def vmapped_seeds(options: "Options") -> int:
-    """Returns how many seeds share one program; 1 if each is trained by itself."""
-    return options.num_seeds if options.seeds_by == "vmap" else 1
+def _train_all(runs: dict[Path, Experiment], job: _Job) -> None:
+    """Trains vmapped seeds together, and others one after another; RunError if one failed."""
+    groups = [[folder] for folder in runs] if job.options.vmapped_seeds == 1 else [list(runs)]
+    failed = []
+    for folders in groups:
+        try:
+            _train_together(job, folders, [runs[folder].seed for folder in folders])
+        except RunError as error:  # the seeds after it can still be trained
+            failed.append(str(error))
+            if len(groups) > 1:  # they may take long, or be stopped
+                print(f"purerl: {error}", file=sys.stderr, flush=True)
+    if failed:
+        raise RunError(" ".join(failed))
 
 
-def begin_or_go_on(
-    folder: Path,
-    source: Source,
-    settings: dict[str, Any],
-    facts: dict[str, Any],
+def _train_together(job: _Job, folders: list[Path], seeds: list[int]) -> None:
+    """Trains one run, or vmapped ones, from the newest checkpoint that all of them have."""
+    plan = job.plan
+    with ExitStack() as stack:
+        progress: Any = processes.Silent()
+        if processes.is_first():
+            progress = stack.enter_context(console.progress(plan.updates))
+        say, saved = progress.say, list[checkpoint.Saved]()
+        places = [folder / "checkpoints" for folder in folders]
+
+        def find() -> dict[str, Any]:
+            saved.extend(checkpoint.newest(places, job.abstract, say))
+            if not saved:
+                checkpoint_folder.check_none_lost(places)
+                if job.options.resume:
+                    say(f"There is no checkpoint in {places[0]}: it begins anew.")
+            known = saved[0].meta if saved else {"wall_s": 0.0, "update": 0}
+            return {name: known[name] for name in ("wall_s", "update")} | {"found": bool(saved)}
+
+        meta = alone(find)
+        found = meta.pop("found")
+        if meta["update"] >= plan.updates:
+            for one in saved:
+                say(f"Already done: {plan.updates} updates. Digest {one.meta['digest']}")
+            return
+        programs = job.programs()
+        times = ", ".join(f"{name} {value:.1f} s" for name, value in programs.seconds.items())
+        say(f"Compiled: {times}")
+        for one in saved:
+            say(f"Resuming after update {one.meta['update']}. Digest {one.meta['digest']}")
+        state = _first_state(found, saved, seeds, programs, job.abstract)
+        writers: list[Any] = [processes.Silent(folder) for folder in folders]
+        if processes.is_first():
+            with run_folder.refusals():
+                writers = _open_writers(folders, saved, job.options, say)
+            for folder, writer in zip(folders, writers, strict=True):
+                stack.callback(writer.close)
+                writer.loggers = open_loggers(job.options, folder, meta["update"], say)
+        meta["fingerprint"] = manifest.fingerprint(job.facts)
+        stop = processes.agreed(job.stop)
+        loop.train(plan, programs, programs.spread(state), writers, progress, stop, meta)
+        for folder, writer in zip(folders, writers, strict=True):
+            of = f" of {folder.name}" if job.options.num_seeds > 1 else ""
+            say(f"Done: {plan.steps:,} steps{of}. Digest {writer.digest}")
+
+
+def _first_state(
+    found: bool,
+    saved: list[checkpoint.Saved],
+    seeds: list[int],
+    programs: Programs,
     abstract: PyTree,
-    allow_changes: bool,
-) -> None:
-    """Describes a new run on disk, or checks that this process would continue the old one."""
-    if not (folder / "config.json").exists():
-        run_folder.start(folder, source, settings, facts)
-        return
-    found = run_folder.check_same(folder, source, settings, facts)
-    if found and not allow_changes:
-        pin = "device.threads"  # a CPU's bits depend on the size of XLA's thread pool
-        threads = [line.split()[1] for line in found if line.startswith(pin)]
-        found += [f"(NPROC={number} brings {pin} back)" for number in threads]
-        edited = [line for line in found if line.startswith("source.")]
-        if len(edited) > MANY:
-            found = [line for line in found if line not in edited]
-            found.append(f"source: {len(edited)} files, as of another version of purerl")
-        raise UserError(
-            f"The run {folder} was begun under other conditions, so it would not go on exactly:\n  "
-            + "\n  ".join(found)
-            + "\nGive the command it was begun with, train anew under another --name, or go on all "
-            "the same with --allow-changes."
-        )
-    if found:
-        checkpoint.check_fits(folder / "checkpoints", abstract)
-        run_folder.accept_changes(folder, source, settings, facts, found)
+) -> TrainState:
+    """Returns the state to begin with: new, or the `saved` one that the first process has found."""
+
+    def together(trees: list[Any]) -> Any:
+        return trees[0] if len(trees) == 1 else jax.tree.map(lambda *x: jnp.stack(x), *trees)
+
+    if not found:
+        return programs.init(together([jax.random.key(seed) for seed in seeds]))
+    state = together([one.state for one in saved]) if saved else None
+    return processes.state_of_first(state, abstract)
+
+
+def _open_writers(
+    folders: list[Path], saved: list[checkpoint.Saved], options: Options, say: Say
+) -> list[RunWriter]:
+    """Opens what writes each seed's folder, cut back to the checkpoints `saved`."""
+    worker = ThreadPoolExecutor(1, "purerl-writer")
+    together = [folder / "checkpoints" for folder in folders]
+    for place in together:
+        checkpoint_folder.forget_after(place, saved[0].meta["update"] if saved else 0)
+    offsets = [one.meta["metrics_bytes"] for one in saved] or [0] * len(folders)
+    return [
+        RunWriter(folder, offset, options.keep, say, worker, together)
+        for folder, offset in zip(folders, offsets, strict=True)
+    ]

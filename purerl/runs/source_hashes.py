@@ -26,7 +26,7 @@ def source_hashes(builders: Iterable[Callable], package: Path = PACKAGE) -> dict
       builders: functions (build_env, build_network) whose imports are part of the run.
       package: the folder of this package's source.
     """
-    files = package_files(package) | imported_files(module_of(builder) for builder in builders)
+    files = package_files(package) | imported_files(map(module_of, builders))
     folders = {file.parent.parent / "assets" for file in files.values()}
     bodies = {f"assets/{f.name}": f for folder in folders for f in folder.rglob("*.xml")}
     # By name, not by place: a moved checkout is the same source.
@@ -64,20 +64,19 @@ def imported_files(names: Iterable[str]) -> dict[str, Path]:
     not: `package_files` lists them.
     """
     todo = list(names)
-    ours = {name.partition(".")[0]: True for name in todo} | {PACKAGE.name: False}
-    installed = installed_folders()
+    ours = {name.partition(".")[0]: True for name in todo} | {PACKAGE.name: False, "": False}
+    installed = _installed_folders()
     found: dict[str, Path] = {}
     while todo:
         name = todo.pop()
-        package, _, inside = name.partition(".")
+        package = name.partition(".")[0]
         if package not in ours:
             ours[package] = not _is_within(package, installed)
         file = module_file(name) if ours[package] and name not in found else None
         if file is not None and file.suffix == ".py":
             found[name] = file
-            todo += _imports(name, file)
-            if inside:  # Python runs a package's __init__.py first
-                todo.append(name.rpartition(".")[0])
+            # Python runs a package's __init__.py first.
+            todo += [*_imports(name, file), name.rpartition(".")[0]]
     return found
 
 
@@ -91,19 +90,14 @@ def _is_within(package: str, folders: set[Path]) -> bool:
     return all(not folders.isdisjoint(Path(place).absolute().parents) for place in places)
 
 
-def installed_folders() -> set[Path]:
+def _installed_folders() -> set[Path]:
     """Returns where Python and installed packages are: beside a package there is its metadata."""
-    places = {Path(place).absolute() for place in sys.path}
-    return {*filter(_holds_packages, places), Path(sysconfig.get_path("stdlib"))}
-
-
-def _holds_packages(folder: Path) -> bool:
-    try:
-        return any(name.endswith(".dist-info") for name in os.listdir(folder))
-    except PermissionError:  # whatever is in it, it cannot be this process's own source
-        return True
-    except OSError:  # an archive, or nothing
-        return False
+    found = {Path(sysconfig.get_path("stdlib"))}
+    for folder in {Path(place).absolute() for place in sys.path}:
+        # What cannot be read cannot be this process's own source.
+        if not os.access(folder, os.R_OK) or any(folder.glob("*.dist-info")):
+            found.add(folder)
+    return found
 
 
 def module_file(name: str) -> Path | None:
@@ -120,10 +114,8 @@ def module_file(name: str) -> Path | None:
         return Path(file) if file else None
     package, *inside = name.split(".")
     spec = importlib.util.find_spec(package)
-    if spec is None:
-        return None
-    if not inside:
-        return Path(spec.origin) if spec.has_location and spec.origin else None
+    if spec is None or not inside:
+        return Path(spec.origin) if spec and spec.has_location and spec.origin else None
     places = [Path(place, *inside) for place in spec.submodule_search_locations or ()]
     files = [file for place in places for file in (place / "__init__.py", place.with_suffix(".py"))]
     return next((file for file in files if file.is_file()), None)

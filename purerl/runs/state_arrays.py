@@ -17,20 +17,25 @@ Leaves = dict[str, np.ndarray]
 
 def leaf_paths(state: PyTree) -> list[str]:
     """Returns the path of every leaf, in the order of `jax.tree.leaves`; abstract states too."""
-    named = jax.tree_util.tree_flatten_with_path(state)[0]
     return [
-        jax.tree_util.keystr(path, simple=True, separator="/") + _key_suffix(leaf)
-        for path, leaf in named
+        jax.tree_util.keystr(path, simple=True, separator="/")
+        + (f"|{_impl(leaf)}" if is_key(leaf) else "")
+        for path, leaf in jax.tree_util.tree_leaves_with_path(state)
     ]
 
 
+def raw(state: PyTree) -> PyTree:
+    """Returns a state with its keys as their raw data."""
+    return jax.tree.map(lambda x: jax.random.key_data(x) if is_key(x) else x, state)
+
+
 def flatten(state: PyTree) -> Leaves:
-    """Copies a state to the host as `{path: array}`, keys as their raw data.
+    """Copies a state to the host as `{path: array}`.
 
     It must copy: on a CPU `device_get` returns views of buffers, which the next update overwrites.
     """
-    raw = jax.tree.map(lambda x: jax.random.key_data(x) if is_key(x) else x, state)
-    host = [np.array(x, copy=True, order="C") for x in jax.tree.leaves(jax.device_get(raw))]
+    there = jax.tree.leaves(jax.device_get(raw(state)))
+    host = [np.array(x, copy=True, order="C") for x in there]
     return dict(zip(leaf_paths(state), host, strict=True))
 
 
@@ -38,8 +43,12 @@ def unflatten(leaves: Leaves, abstract: PyTree) -> PyTree:
     """Rebuilds a state on the device from `flatten`'s arrays (zero-size ones may be absent)."""
     out = []
     for path, like in zip(leaf_paths(abstract), jax.tree.leaves(abstract), strict=True):
+        if is_key(like) and not like.size:
+            raise ValueError(f"A zero-size array of keys (shape {like.shape}) cannot be rebuilt.")
         # A real copy again: a buffer shared with numpy must not be donated.
-        array = jnp.array(_empty(like) if like.size == 0 else leaves[path], copy=True)
+        array = jnp.array(
+            leaves[path] if like.size else np.zeros(like.shape, like.dtype), copy=True
+        )
         out.append(jax.random.wrap_key_data(array, impl=_impl(like)) if is_key(like) else array)
     return jax.tree.unflatten(jax.tree.structure(abstract), out)
 
@@ -61,13 +70,3 @@ def digest_leaves(leaves: Leaves) -> str:
 def _impl(key: Any) -> str:
     """Returns the name of a key's implementation; of abstract keys too, which key_impl refuses."""
     return str(jax.random.key_impl(jnp.empty((0,), key.dtype)))
-
-
-def _key_suffix(leaf: Any) -> str:
-    return f"|{_impl(leaf)}" if is_key(leaf) else ""
-
-
-def _empty(like: Any) -> np.ndarray:
-    if is_key(like):
-        raise ValueError(f"A zero-size array of keys (shape {like.shape}) cannot be rebuilt.")
-    return np.zeros(like.shape, like.dtype)

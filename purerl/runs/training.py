@@ -4,26 +4,25 @@ Nothing here imports JAX before a run begins, so that XLA's flags are set in tim
 """
 
 import dataclasses
+import os
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from purerl.core.errors import UserError
 from purerl.exact import xla_flags
 from purerl.runs.command_line import from_settings
 from purerl.runs.experiment import Experiment, Source, find_source
-from purerl.runs.experiment_file import source_of
 from purerl.runs.loaded_run import Run
 from purerl.runs.options import Options
 
 
 def train(
-    experiment: str | Path | Experiment,
-    settings: Mapping[str, Any] | None = None,
-    **options: Any,
+    experiment: str | Path, settings: Mapping[str, Any] | None = None, **options: Any
 ) -> Run | list[Run]:
     """Trains an experiment: the folder, bits and lines of `python -m purerl.run`.
 
@@ -31,7 +30,7 @@ def train(
     is not the main one receives no signals.
 
     Args:
-      experiment: a name in experiments/, the path of a Python file, a dotted module, or an object.
+      experiment: a name in experiments/, the path of a Python file, or a dotted module.
       settings: dotted names of settings and their values, checked as on the command line.
       options: the run command's options: name, resume, num_seeds, runs, checkpoints, ...
 
@@ -49,42 +48,42 @@ def train(
     >>> run.update, run.steps
     (2, 8192)
     """
+    if isinstance(experiment, Experiment):
+        raise UserError(
+            "A run keeps a copy of its experiment's file, and an Experiment object has none: put "
+            "it into a .py file and give train that file's path. Change its settings by settings=."
+        )
     set_xla_flags_in_time()
-    with ExitStack() as stack:
-        if isinstance(experiment, Experiment):
-            source = stack.enter_context(source_of(experiment))
-        else:
-            source = find_source(str(experiment))
-        chosen, how = from_settings(source, settings or {}, options)
-        runs = runs_of(source, chosen, how)
-        stop = stack.enter_context(stop_signals(_interrupt))
-        train_runs(source, runs, how, stop)
-    found = [Run(folder) for folder in runs]
-    return found[0] if how.num_seeds == 1 else found
+    source = find_source(str(experiment))
+    chosen, how = from_settings(source, settings or {}, options)
+    if how.video:
+        raise UserError("video is an option of the command; call `python -m purerl.render RUN`.")
+    runs = [Run(folder) for folder in train_runs(source, chosen, how, _interrupt)]
+    return runs[0] if how.num_seeds == 1 else runs
 
 
 def train_runs(
-    source: Source, runs: dict[Path, Experiment], options: Options, stop: Callable[[], bool]
-) -> None:
-    """Trains runs, given each one's folder and experiment; `stop` is asked whether to stop."""
-    from purerl.devices.processes import fail_together
+    source: Source, chosen: Experiment, options: Options, end: Callable[[int], Any]
+) -> list[Path]:
+    """Trains an experiment of every seed; returns their folders.
+
+    Args:
+      source: where the experiment came from.
+      chosen: the experiment with its overrides.
+      options: the run's options.
+      end: called with an exit code at the second signal.
+    """
     from purerl.runs.session import execute
 
-    with ExitStack() as stack:
-        stack.enter_context(fail_together())
-        execute(source, runs, options, stop, stack)
-
-
-def runs_of(source: Source, chosen: Experiment, options: Options) -> dict[Path, Experiment]:
-    """Returns each seed's folder and experiment."""
-    place, last = options.runs / source.name, chosen.seed + options.num_seeds
-    if options.num_seeds == 1:
-        return {place / (options.name or f"seed{chosen.seed}"): chosen}
-    prefix = f"{options.name}-" if options.name else ""
-    return {
-        place / f"{prefix}seed{seed}": dataclasses.replace(chosen, seed=seed)
-        for seed in range(chosen.seed, last)
-    }
+    place, runs = options.runs / source.name, {}
+    for seed in range(chosen.seed, chosen.seed + options.num_seeds):
+        name = options.name or f"seed{seed}"
+        if options.num_seeds > 1 and options.name:
+            name += f"-seed{seed}"
+        runs[place / name] = dataclasses.replace(chosen, seed=seed)
+    with stop_signals(end) as stop:
+        execute(source, runs, options, stop)
+    return list(runs)
 
 
 def set_xla_flags_in_time() -> None:
@@ -99,10 +98,9 @@ def set_xla_flags_in_time() -> None:
         )
         return
     xla_flags.set_xla_flags()
-    if "jax" in sys.modules:  # it read the environment when it was imported
-        kept = xla_flags.os.environ.get(xla_flags.KEPT_TIMINGS)
-        if kept is not None:
-            sys.modules["jax"].config.update(xla_flags.KEPT_TIMINGS.lower(), kept)
+    kept = os.environ.get(xla_flags.KEPT_TIMINGS)
+    if "jax" in sys.modules and kept is not None:  # it read the environment when it was imported
+        sys.modules["jax"].config.update(xla_flags.KEPT_TIMINGS.lower(), kept)
 
 
 def _runs_on_gpu() -> bool:
@@ -116,14 +114,9 @@ def _runs_on_gpu() -> bool:
 
 @contextmanager
 def stop_signals(end: Callable[[int], Any]) -> Iterator[Callable[[], bool]]:
-    """Turns SIGTERM and SIGINT into a request to stop.
+    """Yields a question: did SIGTERM or SIGINT ask to stop? A second signal calls `end(exit code)`.
 
-    Args:
-      end: called with an exit code at the second signal.
-
-    Returns:
-      A question: was a stop requested? Outside of the main thread, which alone receives signals,
-      the answer is always no.
+    Only the main thread receives signals: in another one the answer is always no.
     """
     received: list[int] = []
 
@@ -132,17 +125,13 @@ def stop_signals(end: Callable[[int], Any]) -> Iterator[Callable[[], bool]]:
             end(128 + number)
             return
         received.append(number)
-        print(
-            f"\n{signal.Signals(number).name}: finishing this chunk, then saving. "
-            "Once more to stop at once.",
-            file=sys.stderr,
-            flush=True,
-        )
+        name = signal.Signals(number).name
+        said = f"\n{name}: finishing this chunk, then saving. Once more to stop at once."
+        print(said, file=sys.stderr, flush=True)
 
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
-        return
-    old = {number: signal.signal(number, handle) for number in (signal.SIGTERM, signal.SIGINT)}
+    old = {}
+    if threading.current_thread() is threading.main_thread():
+        old = {number: signal.signal(number, handle) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
         yield lambda: bool(received)
     finally:

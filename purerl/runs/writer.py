@@ -1,7 +1,7 @@
 """Writes a run's metrics and checkpoints, in order, from one background thread.
 
-The order matters: a checkpoint says how long metrics.jsonl was when it was taken. One thread keeps
-the order, and training does not wait for hashes or the disk.
+The order matters: a checkpoint says how long metrics.jsonl was when it was taken. Training does not
+wait for hashes or the disk.
 """
 
 from collections.abc import Sequence
@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import RunError, one_line
-from purerl.runs import checkpoint, checkpoint_folder, state_arrays
-from purerl.runs.loggers import MetricsFile, Record, Say
+from purerl.runs import checkpoint, checkpoint_folder
+from purerl.runs.loggers import BackgroundLogger, MetricsFile, Record, Say
+from purerl.runs.state_arrays import Leaves, digest_leaves
 
 
 class RunWriter:
@@ -42,9 +43,8 @@ class RunWriter:
         self.checkpoints.mkdir(exist_ok=True)
         checkpoint_folder.clean(self.checkpoints)
         self.metrics = MetricsFile(folder / "metrics.jsonl", offset)
-        self.keep, self.say = keep, say
-        self.loggers: list[Any] = []  # BackgroundLogger or RunVideo
-        self.worker, self.together = worker, together
+        self.keep, self.say, self.worker, self.together = keep, say, worker, together
+        self.loggers: list[BackgroundLogger] = []
         self.last: Future[None] | None = None
         self.saving: Future[None] | None = None
         self.digest: str | None = None  # of the newest checkpoint written here
@@ -55,9 +55,7 @@ class RunWriter:
         """Hands a line to the loggers, and to the thread that appends it to metrics.jsonl."""
         self._submit(self._write, record)
 
-    def save(
-        self, record: Record, leaves: state_arrays.Leaves, meta: dict[str, Any], planned: bool
-    ) -> None:
+    def save(self, record: Record, leaves: Leaves, meta: dict[str, Any], planned: bool) -> None:
         """Writes a line and saves a checkpoint; waits only while the last one is being written.
 
         Args:
@@ -85,7 +83,7 @@ class RunWriter:
     def close(self) -> None:
         """Stops the thread and the loggers."""
         self.worker.shutdown()
-        self.metrics.close()
+        self.metrics.file.close()
         for logger in self.loggers:
             logger.close()
 
@@ -103,10 +101,8 @@ class RunWriter:
         except OSError as error:
             self._failed(f"A line of metrics.jsonl could not be written: {one_line(error)}.")
 
-    def _save(
-        self, record: Record, leaves: state_arrays.Leaves, meta: dict[str, Any], planned: bool
-    ) -> None:
-        digest = state_arrays.digest_leaves(leaves)
+    def _save(self, record: Record, leaves: Leaves, meta: dict[str, Any], planned: bool) -> None:
+        digest = digest_leaves(leaves)
         self.last_failed = True
         try:
             offset = self.metrics.append(record | {"digest": digest} if planned else record)

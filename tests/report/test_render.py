@@ -3,8 +3,6 @@
 import dataclasses
 import json
 import shutil
-import sys
-import time
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -21,7 +19,6 @@ from purerl.core.errors import FAILURE, USAGE, RunError
 from purerl.core.keys import per_environment
 from purerl.report import episode_pictures
 from purerl.report import renderer as drawing
-from purerl.runs import video_process
 from purerl.runs.run_folder import restore
 from tests import quick
 
@@ -351,12 +348,12 @@ def test_files_that_cannot_be_written_are_one_line(trained, tmp_path, capsys):
     assert len(list((copy / "videos").iterdir())) == 2  # no draft is left
 
 
-# --- while training ---
+# --- with the run command ---
 
 
 def test_a_run_makes_a_video_and_learns_the_same(trained, place, capsys):
     folder = train(place, "with-video", "--video")
-    assert "Video: " in capsys.readouterr().out
+    assert capsys.readouterr().out.splitlines()[-1].endswith("000000000003.mp4")
     _, frames = read_video(folder / "videos" / "000000000003.mp4")
     assert len(frames) == 61
 
@@ -368,68 +365,13 @@ def test_a_run_makes_a_video_and_learns_the_same(trained, place, capsys):
     assert "digest" in lines(folder)[-1]
 
 
-class Stage:
-    """A run's folder and what `RunVideo` sees of it."""
-
-    def __init__(self, folder: Path, script: str) -> None:
-        self.folder, self.said, self.stopped, self.started = folder, [], False, 0
-        self.script = script
-        self.video = video_process.RunVideo(
-            folder, lambda: self.stopped, self.said.append, self.command
-        )
-
-    def command(self, folder: Path) -> list[str]:
-        self.started += 1
-        return [sys.executable, "-c", self.script]
-
-    def evaluate(self, update: int, saved: bool = True) -> None:
-        if saved:
-            (self.folder / "checkpoints" / f"{update:012d}").mkdir(parents=True)
-        self.video.log({"update": update, "eval/episode_return": 1.0})
-
-
-def wait(stage: Stage) -> None:
-    process = stage.video.process
-    assert process is not None
-    process.wait(20)
-
-
-def test_one_video_at_a_time_and_the_newest_next(tmp_path):
-    stage = Stage(tmp_path, "import time; time.sleep(0.5); print('there.mp4')")
-    stage.evaluate(1, saved=False)
-    assert stage.started == 0  # nothing to show yet
-    stage.evaluate(2)
-    for update in (3, 4, 5):
-        stage.evaluate(update)
-    assert stage.started == 1
-    wait(stage)
-    stage.video.log({"update": 6})
-    assert stage.started == 2 and stage.said == ["Video: there.mp4"]
-    stage.video.close()
-    stage.video.close()
-    assert stage.started == 2 and stage.video.process is None
-    assert stage.said[1:] == [
-        "Waiting for the last video; Ctrl-C leaves it out.",
-        "Video: there.mp4",
-    ]
-
-
-def test_a_failure_is_told_once_and_ends_it(tmp_path):
-    stage = Stage(tmp_path, "import sys; sys.exit('purerl: There is no OpenGL to draw with.')")
-    stage.evaluate(1)
-    wait(stage)
-    for update in (2, 3):
-        stage.evaluate(update)
-    stage.video.close()
-    assert stage.started == 1 and len(stage.said) == 1
-    assert "There is no OpenGL to draw with. Training goes on." in stage.said[0]
-
-
-def test_a_stopped_run_does_not_wait_for_it(tmp_path):
-    stage = Stage(tmp_path, "import time; time.sleep(60)")
-    stage.evaluate(1)
-    process = stage.video.process
-    stage.stopped = True
-    begin = time.monotonic()
-    stage.video.close()
-    assert time.monotonic() - begin < 5 and process.returncode not in (None, 0)
+def test_a_video_that_cannot_be_made_changes_nothing(trained, place, monkeypatch, capsys):
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    folder = train(place, "without-opengl", "--video")  # with exit code 0
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 2  # before training and after it
+    assert all("There is no video: MUJOCO_GL is 'disable'" in line for line in said)
+    assert not (folder / "videos").exists()
+    saved = [path / "checkpoints" / "000000000003" / "meta" for path in (folder, trained)]
+    digests = [json.loads((path / "metadata").read_text())["digest"] for path in saved]
+    assert digests[0] == digests[1]

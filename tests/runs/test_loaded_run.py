@@ -25,13 +25,13 @@ FEW = {"ppo.num_steps": 512, "network.value_hidden": (8,), "evaluation.number": 
 @pytest.fixture(scope="module", params=[recurrent, privileged], ids=["memory", "dict"])
 def run(request, tmp_path_factory) -> purerl.Run:
     place = tmp_path_factory.mktemp(request.param.__name__)
-    return purerl.train(request.param.experiment, FEW, runs=place)
+    return purerl.train(request.param.__file__, FEW, runs=place)
 
 
 def first_keys(seed: int, number: int):
     """Keys of the starts of an evaluation's episodes."""
     key = derive(jax.random.key(seed), Purpose.EVALUATION)
-    return per_environment(jax.random.split(key)[0], number)
+    return per_environment(jax.random.split(key)[0], jnp.arange(number))
 
 
 def test_its_actions_are_those_of_an_evaluation(run):
@@ -150,7 +150,7 @@ def test_the_examples_in_the_docstrings_hold(tmp_path, capsys):
 
 
 def test_a_policy_needs_no_run(run):
-    made = purerl.Policy(run.config, run.env, run.network, run.state)
+    made = purerl.Policy(run.env, run.network, run.state)
     observation = run.env.reset(jax.random.key(3)).observation
     run.policy.reset()
     np.testing.assert_array_equal(made(observation), run.policy(observation))

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from purerl.core.errors import UserError
-from purerl.runs.loggers import BackgroundLogger, MetricsFile, TensorBoardSink, summarize
+from purerl.runs.loggers import BackgroundLogger, MetricsFile, _TensorBoardSink, summarize
 
 
 def test_counts_are_summed_and_episodes_weigh_by_their_number():
@@ -117,7 +117,7 @@ def test_a_logger_that_hangs_never_makes_training_wait():
 
 def test_tensorboard_files_are_written(tmp_path):
     pytest.importorskip("tensorboardX")
-    sink = TensorBoardSink(tmp_path, 0)
+    sink = _TensorBoardSink(tmp_path, 0)
     sink.log({"update": 1, "train/kl": 0.5, "eval/x": None})
     sink.close()
     assert b"train/kl" in next((tmp_path / "tensorboard").iterdir()).read_bytes()

@@ -41,7 +41,7 @@ experiment = dataclasses.replace(
     experiment,
     build_env=build,
     ppo=Config(num_steps=400, num_envs=4, rollout_length=25, num_minibatches=1, episode_length=20),
-    network=MlpOptions((8,), (8,)),
+    network=MlpOptions(policy_hidden=(8,), value_hidden=(8,)),
 )
 """
 

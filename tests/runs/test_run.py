@@ -383,7 +383,7 @@ def test_a_failing_logger_does_not_stop_training(whole, tmp_path, monkeypatch, c
         raise RuntimeError("the server is on fire")
 
     pytest.importorskip("tensorboardX")
-    monkeypatch.setattr(loggers.TensorBoardSink, "log", fail)
+    monkeypatch.setattr(loggers._TensorBoardSink, "log", fail)
     assert start(tmp_path, "--checkpoints", "4", "--tensorboard") == SUCCESS
     assert capsys.readouterr().out.count("TensorBoard logger is dropped") == 1
     assert lines(tmp_path) == lines(whole)
@@ -431,7 +431,7 @@ def test_a_read_only_folder_is_told_and_unharmed(whole, unprivileged, capsys):
     before = [f.read_bytes() for f in sorted(place.rglob("*")) if f.is_file()]
     lose_privileges()
     said = refused(capsys, start(place, "--resume"))
-    assert f"{folder(place)} cannot be written: Permission denied" in said
+    assert f"{folder(place)}/.lock cannot be written: Permission denied" in said
     assert "cannot be written" in refused(capsys, start(place, "--name", "new"))
     assert [f.read_bytes() for f in sorted(place.rglob("*")) if f.is_file()] == before
 

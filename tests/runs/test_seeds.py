@@ -47,10 +47,10 @@ def kept(runs: Path, seed: str) -> list[int]:
 
 
 def test_a_mapped_seed_that_fails_is_told_before_the_next_one(tmp_path, monkeypatch, capsys):
-    def fail(_folders, seeds, *_):
+    def fail(_job, _folders, seeds):
         raise RunError("It diverged.") if seeds == [1] else UserError("Enough.")
 
-    monkeypatch.setattr(session, "train_together", fail)
+    monkeypatch.setattr(session, "_train_together", fail)
     assert start(tmp_path, "--num-seeds", "2", "--seeds-by", "map") == USAGE
     assert capsys.readouterr().err.splitlines() == ["purerl: It diverged.", "purerl: Enough."]
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import functools
 import json
 import os
 import re
@@ -21,7 +20,7 @@ import purerl
 from purerl import compare, evaluate, record, render, run
 from purerl.core.errors import USAGE
 from purerl.exact import xla_flags
-from purerl.runs import experiment_file, training
+from purerl.runs import training
 from purerl.runs.command_line import from_settings
 from purerl.runs.experiment import Experiment, Source, from_json, to_json
 from purerl.runs.experiment import settings as settings_of
@@ -206,79 +205,17 @@ def test_settings_survive_json(env):
     assert from_json(BASE, json.loads(json.dumps(to_json(chosen)))) == chosen
 
 
-@settings(deadline=None)
-@given(KINDS)
-def test_a_written_file_rebuilds_the_experiment(env):
-    chosen = dataclasses.replace(BASE, env=env)
-    namespace: dict = {}
-    exec(experiment_file.source_text(chosen), namespace)
-    assert namespace["experiment"] == chosen
+def test_an_object_is_told_to_be_a_file_and_one_from_find_too(tmp_path):
+    for mine in (toy_experiment.experiment, purerl.find(str(TOY))):
+        with pytest.raises(purerl.UserError, match="put it into a .py file and give") as error:
+            purerl.train(mine, SETTINGS, runs=tmp_path)
+        assert "\n" not in str(error.value) and not list(tmp_path.iterdir())
 
 
-def test_an_experiment_found_is_its_file(trained, tmp_path):
-    found = purerl.find(str(TOY))
-    assert purerl.find(str(TOY)) is not found  # loaded twice
-    by_object = purerl.train(found, SETTINGS, runs=tmp_path)
-    assert by_object.folder == tmp_path / "toy_experiment" / "seed3"
-    first, second = written(trained.folder), written(by_object.folder)
-    assert first == second
-
-
-def test_an_experiment_made_in_python_has_a_file_that_rebuilds_it(trained, tmp_path, capsys):
-    env = dataclasses.replace(toy_experiment.experiment.env, steps=3)
-    mine = dataclasses.replace(toy_experiment.experiment, env=env)
-    made = purerl.train(mine, SETTINGS, name="made", runs=tmp_path)
-    assert made.folder == tmp_path / "experiment" / "made"
-    assert made.digest == trained.digest
-    text = (made.folder / "experiment.py").read_text()
-    assert "import tests.runs.toy_experiment\n" in text and "import purerl\n" in text
-    assert "purerl.networks.mlp" in text and "purerl.ppo" not in text
-    capsys.readouterr()
-    assert evaluate.main([str(made.folder), "--episodes", "2"]) == 0
-    assert "any more" not in capsys.readouterr().out
-    assert purerl.train(mine, SETTINGS, name="made", runs=tmp_path, resume=True).digest
-
-
-def test_an_experiment_whose_module_was_loaded_again_still_has_a_file(monkeypatch):
-    first = purerl.find("tests.runs.toy_experiment")
-    monkeypatch.delitem(sys.modules, "tests.runs.toy_experiment")
-    second = purerl.find("tests.runs.toy_experiment")
-    assert first.build_env is not second.build_env
-    for one in (first, second):
-        with experiment_file.source_of(dataclasses.replace(one, seed=7)) as source:
-            assert "import tests.runs.toy_experiment" in source.path.read_text()
-
-
-def local(*arguments):
-    raise AssertionError
-
-
-def replaced(*arguments):
-    raise AssertionError
-
-
-was_replaced = replaced
-
-
-def replaced(*arguments):  # noqa: F811
-    raise ValueError
-
-
-def in_main(*arguments):
-    raise AssertionError
-
-
-in_main.__module__ = "__main__"
-
-
-@pytest.mark.parametrize(
-    "build", [lambda *_: None, in_main, functools.partial(local), was_replaced]
-)
-def test_a_builder_that_no_file_can_import_is_one_line(build, tmp_path):
-    mine = dataclasses.replace(toy_experiment.experiment, build_env=build)
-    with pytest.raises(purerl.UserError, match="build_env is .*put it into a .py file") as error:
-        purerl.train(mine, runs=tmp_path)
-    assert "\n" not in str(error.value) and not list(tmp_path.iterdir())
+def test_a_video_is_the_commands(tmp_path):
+    with pytest.raises(purerl.UserError, match="purerl.render RUN"):
+        purerl.train(str(TOY), SETTINGS, runs=tmp_path, video=True)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
