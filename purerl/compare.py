@@ -1,13 +1,12 @@
 """Compares runs: `python -m purerl.compare RUN RUN ... [--metric eval/episode_return] [--out DIR]`.
 
-Runs of one configuration and seed: the same to the last bit, or the update and the leaf where they
-part. Runs of several seeds: interquartile means with 95% bootstrap intervals, the probability that
-one configuration beats another, differences on the same seeds, learning curves.
+Runs of one configuration and seed: the same to the last bit, or where they part. Runs of several
+seeds: interquartile means with 95% intervals, the probability that one configuration beats another,
+differences on the same seeds, learning curves.
 
 Exit codes: 0 compared; 1 two runs that promise the same bits have not; 2 a mistake in the command.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,8 @@ from typing import Annotated
 import tyro
 
 from purerl.core.errors import FAILURE, SUCCESS, UserError
-from purerl.runs.command_errors import leave, tell
+from purerl.runs.command_errors import leave
+from purerl.runs.command_line import carry_out
 
 
 @dataclass(frozen=True)
@@ -40,22 +40,21 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    from purerl.report import comparison
-    from purerl.report.comparison_text import describe
-    from purerl.runs.command_line import parse
+    return carry_out(Options, command, "python -m purerl.compare", arguments)
 
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
-    try:
-        options = parse(Options, arguments, "python -m purerl.compare")
-        if not options.runs:
-            raise UserError("Give the runs to compare: python -m purerl.compare RUN RUN ...")
-        result, curves = comparison.compare(options.runs, options.metric, options.group_by)
-        print("\n".join(describe(result)))
-        if options.out is not None:
-            comparison.write(options.out, result, curves)
-    except UserError as error:
-        return tell(error)
-    return FAILURE if comparison.breaks_a_promise(result) else SUCCESS
+
+def command(options: Options) -> int:
+    """Compares, prints and writes what was asked for; returns the exit code."""
+    from purerl.report import comparison
+
+    if not options.runs:
+        raise UserError("Give the runs to compare: python -m purerl.compare RUN RUN ...")
+    result, curves = comparison.compare(options.runs, options.metric, options.group_by)
+    print("\n".join(comparison.describe(result)))
+    if options.out is not None:
+        comparison.write(options.out, result, curves)
+    broken = any(pair["same"] is False and pair["promised"] for pair in result["pairs"])
+    return FAILURE if broken else SUCCESS
 
 
 if __name__ == "__main__":

@@ -51,8 +51,7 @@ def command(options: Options) -> None:
 
 def describe(result: dict[str, Any]) -> list[str]:
     """Returns the result as lines for a person, the return first."""
-    metrics = dict(result["metrics"])
-    ordered = {"episode_return": metrics.pop("episode_return")} | metrics
+    ordered = {"episode_return": result["metrics"]["episode_return"]} | result["metrics"]
     width = max(map(len, ordered))
     return [
         f"{result['run']}, update {result['update']:,} ({result['steps']:,} steps), "

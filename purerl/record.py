@@ -1,11 +1,10 @@
 """Records episodes as arrays in one file: `python -m purerl.record RUN [--out episodes.npz]`.
 
-The episodes begin as those of `python -m purerl.evaluate RUN --engine E --seed S` with as many of
-them do: deterministic, in fresh environments. Another program computes them, so the last bits
-differ, and a body with contacts goes its own way in the end: count returns from `reward` here.
-Every array is [N, T, ...] but for `length`, N episodes of at most T policy steps:
+They begin as those of `python -m purerl.evaluate RUN` with the same options. Another program
+computes them, so the last bits differ, and a body with contacts goes its own way in the end: count
+returns from `reward` here. Every array but `length` is [N, T, ...]: N episodes of at most T steps.
 
-    length [N]          policy steps of the episode; what comes after them is no part of it
+    length [N]          steps of the episode; what comes after them is no part of it
     observation         before the step, as the environment gives it (the network gets it
                         normalized), [O] or a dict's parts
     physics/qpos ...    the simulation's state before the step
@@ -14,11 +13,11 @@ Every array is [N, T, ...] but for `length`, N episodes of at most T policy step
     action [A]          in [-1, 1]; `reward` of the step that it began; `value` of the observation
     memory/...          of a recurrent network, before the step
     network/MODULE      what each module of a Flax network returned: `network/policy/Dense_0` is a
-                        layer before its activation, `network/policy` the last one after it; a
-                        part of what it returned is named after a dot, `network/head.scale`
+                        layer before its activation, `network/policy` the last one after it,
+                        `network/head.scale` a part of what `head` returned; modules inside Flax's
+                        own loops (`nn.scan`, `nn.vmap`) are left out
 
 MuJoCo's model, to compute from `qpos` where limbs are, is `purerl.load(RUN).env.physics.model`.
-What a module does inside Flax's own loops (`nn.scan`, `nn.vmap`) cannot be noted.
 """
 
 import os

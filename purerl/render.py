@@ -1,10 +1,10 @@
 """Makes a video of a run's policy: `python -m purerl.render RUN [--checkpoint best]`.
 
-RUN is a run's folder. RUN/videos/<update>.mp4 shows the deterministic policy in real time, in the
-geometry that each episode really had; RUN/videos/<update>.png shows 16 moments of it on one sheet.
-No screen is needed.
+RUN is a run's folder. RUN/videos/<update>.mp4 shows the deterministic policy in real time, in each
+episode's own geometry; <update>.png beside it shows 16 moments of it. No screen is needed.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -35,9 +35,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def command(options: Options) -> None:
     """Checks the options, makes the video, and prints where it is."""
-    from purerl.report.renderer import open_gl, parse_size
+    from purerl.report.opengl import open_gl
 
-    size = parse_size(options.size)
+    size = _parse_size(options.size)
     for name, least in (("episodes", 1), ("seconds", 0.1)):
         if not getattr(options, name) >= least:
             raise UserError(f"{name} is {getattr(options, name)}; it must be at least {least}.")
@@ -48,10 +48,22 @@ def command(options: Options) -> None:
     from purerl.runs.loaded_run import load
 
     run = load(options.run, options.checkpoint, options.engine)
-    path, lines = make_video(
-        run, options.camera, options.episodes, options.seconds, size, options.seed
-    )
-    print("\n".join([*lines, str(path)]))
+    about = (options.camera, options.episodes, options.seconds, size, options.seed)
+    path, lines = make_video(run, *about)
+    print(*lines, path, sep="\n")
+
+
+def _parse_size(size: str) -> tuple[int, int]:
+    """Returns (width, height) [pixels] of "640x480"."""
+    parts = re.fullmatch(r"(\d+)x(\d+)", size.lower())
+    if parts is None:
+        raise UserError(f"size is {size!r}; give width x height in pixels, such as 640x480.")
+    width, height = map(int, parts.groups())
+    if width % 2 or height % 2 or not 16 <= min(width, height) <= max(width, height) <= 4096:
+        raise UserError(
+            f"size is {size}; width and height must be even and from 16 to 4096 pixels."
+        )
+    return width, height
 
 
 if __name__ == "__main__":

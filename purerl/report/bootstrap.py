@@ -1,12 +1,7 @@
-"""Statistics over seeds, for few seeds: interquartile mean, bootstrap intervals, improvement.
+"""Statistics over few seeds: interquartile mean, bootstrap intervals, improvement.
 
-After Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice"
-(arXiv:2108.13264). A stratum holds the runs of one configuration on one task, which are drawn from
-independently of the others. Letters: n runs of a stratum, P points of a curve, R resamples.
-
-Percentile bootstrap intervals of a few runs are too narrow: of 3000 draws of normal values, the
-nominal 95% interval of the interquartile mean held the truth for 90% of those of 5 values and 94%
-of those of 10. So there is none below `LEAST_RUNS` runs.
+After Agarwal et al. 2021, arXiv:2108.13264. A stratum holds the runs of one configuration on one
+task. Letters: n runs of a stratum, P points of a curve, R resamples.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,7 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-LEAST_RUNS = 5  # below, no interval is given
+# Below, no interval is given: percentile bootstrap intervals of a few runs are too narrow. Of 3000
+# draws of normal values, the nominal 95% interval of the interquartile mean held the truth for 90%
+# of those of 5 values and 94% of those of 10.
+LEAST_RUNS = 5
 RESAMPLES = 5000
 LEVEL = 0.95
 Values = np.ndarray
@@ -62,31 +60,9 @@ def stratified_probability(xs: Sequence[Values], ys: Sequence[Values]) -> Values
 
 
 def resample(strata: Sequence[Values], seed: int, number: int = RESAMPLES) -> list[Values]:
-    """Draws whole runs with replacement, within each stratum.
-
-    Args:
-      strata: each [n_k].
-      seed: of the draws; equal seeds give equal intervals.
-      number: R.
-
-    Returns:
-      For each stratum [R, n_k].
-    """
+    """Draws whole runs with replacement, R times within each stratum: each [n_k] -> [R, n_k]."""
     generator = np.random.default_rng(seed)
-    indices = [generator.integers(0, len(s), (number, len(s))) for s in strata]
-    return [s[i] for s, i in zip(strata, indices, strict=True)]
-
-
-def percentile_interval(replicates: Values) -> Interval:
-    """Returns the middle `LEVEL` of bootstrap replicates [R]."""
-    tail = 50.0 * (1.0 - LEVEL)
-    low, high = np.percentile(replicates, [tail, 100.0 - tail])
-    return Interval(float(low), float(high))
-
-
-def enough(*groups: Sequence[Values]) -> bool:
-    """Tells whether every stratum of every group has runs enough for an interval."""
-    return all(len(stratum) >= LEAST_RUNS for strata in groups for stratum in strata)
+    return [s[generator.integers(0, len(s), (number, len(s)))] for s in strata]
 
 
 def iqm_interval(strata: Sequence[Values], seed: int = 0) -> Interval | None:
@@ -94,27 +70,34 @@ def iqm_interval(strata: Sequence[Values], seed: int = 0) -> Interval | None:
     return _interval(pooled_iqm, [strata], seed)
 
 
-def difference_interval(
-    xs: Sequence[Values], ys: Sequence[Values], seed: int = 0
-) -> Interval | None:
+def difference_interval(xs: Sequence[Values], ys: Sequence[Values]) -> Interval | None:
     """Returns the interval of IQM(x) - IQM(y), both resampled; None for too few runs."""
-    return _interval(lambda x, y: pooled_iqm(x) - pooled_iqm(y), [xs, ys], seed)
+    return _interval(lambda x, y: pooled_iqm(x) - pooled_iqm(y), [xs, ys])
 
 
-def improvement_interval(
-    xs: Sequence[Values], ys: Sequence[Values], seed: int = 0
-) -> Interval | None:
+def improvement_interval(xs: Sequence[Values], ys: Sequence[Values]) -> Interval | None:
     """Returns the interval of the probability of improvement; None for too few runs."""
-    return _interval(stratified_probability, [xs, ys], seed)
+    return _interval(stratified_probability, [xs, ys])
 
 
 def _interval(
-    statistic: Callable[..., Values], groups: Sequence[Sequence[Values]], seed: int
+    statistic: Callable[..., Values], groups: Sequence[Sequence[Values]], seed: int = 0
 ) -> Interval | None:
     """Returns the interval of a statistic of groups, each resampled; None for too few runs."""
-    if not enough(*groups):
+    if not all(map(_enough, groups)):
         return None
-    return percentile_interval(statistic(*(resample(x, seed + i) for i, x in enumerate(groups))))
+    return _percentiles(statistic(*(resample(x, seed + i) for i, x in enumerate(groups))))
+
+
+def _enough(strata: Sequence[Values]) -> bool:
+    return all(len(stratum) >= LEAST_RUNS for stratum in strata)
+
+
+def _percentiles(replicates: Values) -> Interval:
+    """Returns the middle `LEVEL` of bootstrap replicates [R]."""
+    tail = 50.0 * (1.0 - LEVEL)
+    low, high = np.percentile(replicates, [tail, 100.0 - tail])
+    return Interval(float(low), float(high))
 
 
 class Band(NamedTuple):
@@ -125,21 +108,21 @@ class Band(NamedTuple):
     high: Values | None
 
 
-def curve_band(strata: Sequence[Values], seed: int = 0, number: int = 2000) -> Band:
+def curve_band(strata: Sequence[Values], number: int = 2000) -> Band:
     """Returns IQM and pointwise interval of curves.
+
+    Runs are drawn whole, so that every point is of the same resamples.
 
     Args:
       strata: each [n_k, P], one row a run.
-      seed: of the draws; runs are drawn whole, so that every point is of the same resamples.
       number: R.
     """
     iqm = pooled_iqm([s.T for s in strata])
-    if not enough(strata):
+    if not _enough(strata):
         return Band(iqm, None, None)
-    rows = resample([np.arange(len(s)) for s in strata], seed, number)
-    points = range(strata[0].shape[1])
-    drawn = [
-        percentile_interval(pooled_iqm([s[i, p] for s, i in zip(strata, rows, strict=True)]))
-        for p in points
+    rows = resample([np.arange(len(s)) for s in strata], 0, number)
+    ends = [
+        _percentiles(pooled_iqm([s[i, p] for s, i in zip(strata, rows, strict=True)]))
+        for p in range(len(iqm))
     ]
-    return Band(iqm, np.array([b.low for b in drawn]), np.array([b.high for b in drawn]))
+    return Band(iqm, *np.array(ends).T)

@@ -1,14 +1,31 @@
-"""Runs compared with each other: `compare` gathers everything, `write` puts it into files."""
+"""Runs compared: `compare` gathers everything, `describe` tells it, `write` makes files of it."""
 
 import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import UserError
 from purerl.report import bit_diff, run_reader, seed_statistics
+from purerl.report.bootstrap import LEAST_RUNS
 from purerl.report.seed_statistics import Curve
+from purerl.runs import manifest
 from purerl.runs.files import write_json
+
+# A table's columns: what stands above, and the key of the value.
+GROUPS = [
+    ("group", "label"), ("n", "n"), ("IQM", "iqm"), ("95% interval", "interval"), ("mean", "mean"),
+    ("10th pct", "tenth"), ("worst", "worst"), ("in", "worst_run"), ("failed", "failed"),
+]  # fmt: skip
+VERSUS = [
+    ("group", "label"), ("IQM difference", "difference"), ("95% interval", "difference_interval"),
+    ("P(better)", "improvement"), ("95% interval", "improvement_interval"),
+    ("pairs", "same_seeds"),
+    ("paired IQM", "paired_difference"), ("95% interval", "paired_interval"),
+]  # fmt: skip
+GROUPS_CSV = ["label", "n", "done", "failed", "unfinished", "iqm", "mean", "tenth", "worst"]
+GROUPS_CSV += ["worst_run", "low", "high"]
+CURVES_CSV = ["group", "n", "steps", "iqm", "low", "high"]
 
 
 def compare(
@@ -25,88 +42,141 @@ def compare(
       The whole comparison as JSON values, and the groups' learning curves.
 
     Raises:
-      UserError: an argument means no run, or there is no such metric or setting.
+      UserError: a place means no run, or there is no such metric or setting.
     """
     runs = [run_reader.read(path) for path in run_reader.find_runs(places)]
-    pairs = [bit_diff.compare_bits(a, b) for a, b in bit_diff.repeats(runs)]
+    first: dict[str, run_reader.RunRecord] = {}
+    repeats = [(first.setdefault(run.identity, run), run) for run in runs]
+    pairs = [bit_diff.compare_bits(a, b) for a, b in repeats if a is not b]
     groups = seed_statistics.make_groups(runs, group_by)
-    summaries, unscored = [], ""
+    unscored = ""
     try:
-        run_reader.check_metric(runs, metric)
-        summaries = [seed_statistics.summarize(group, metric) for group in groups]
-        seed_statistics.check_scored(summaries, metric)
+        seed_statistics.check_scored(runs, groups, metric)
     except UserError as error:
         if not pairs:
             raise
-        groups, summaries, unscored = [], [], str(error)  # the bits can be compared all the same
+        groups, unscored = [], str(error)  # the bits can be compared all the same
+    conditions = [
+        line for run in runs[1:] for line in manifest.differences(runs[0].manifest, run.manifest)
+    ]
     against = [seed_statistics.versus(group, groups[0], metric) for group in groups[1:]]
     curves = [seed_statistics.learning_curve(group, metric) for group in groups]
     result = {
         "metric": metric,
         "runs": len(runs),
         "settings_that_differ": seed_statistics.differing(runs),
-        "conditions_that_differ": bit_diff.differing_conditions(runs),
-        "pairs": [pair._asdict() for pair in pairs],
+        "conditions_that_differ": list(dict.fromkeys(conditions)),
+        "pairs": pairs,
         "unscored": unscored,
-        "groups": [_as_json(summary) for summary in summaries],
-        "versus_first": [_as_json(v) for v in against if v is not None],
+        "groups": [seed_statistics.summarize(group, metric) for group in groups],
+        "versus_first": [found for found in against if found is not None],
     }
     return result, [curve for curve in curves if curve is not None]
 
 
-def breaks_a_promise(result: dict[str, Any]) -> bool:
-    """Tells whether two runs that promise the same bits have not the same."""
-    return any(pair["same"] is False and pair["promised"] for pair in result["pairs"])
+# --- text ---
 
 
-def _as_json(record: Any) -> dict[str, Any]:
-    """Returns a NamedTuple as a dict, intervals as {"low", "high"}."""
-    return {k: v._asdict() if hasattr(v, "_asdict") else v for k, v in record._asdict().items()}
+def describe(result: dict[str, Any]) -> list[str]:
+    """Returns what `compare` found as lines of text."""
+    lines = [f"{result['runs']} runs, {result['metric']} at the end"]
+    for pair in result["pairs"]:
+        lines += [f"{pair['first']} and {pair['second']}, of one configuration and seed:"]
+        lines += [f"  {line}" for line in pair["lines"]]
+    for name, values in result["settings_that_differ"].items():
+        lines.append(f"differs: {name} is {' | '.join(map(str, values))}")
+    lines += [f"other conditions: {line}" for line in result["conditions_that_differ"]]
+    if result["unscored"]:
+        return [*lines, f"No scores: {result['unscored']}"]
+    groups, versus = result["groups"], result["versus_first"]
+    lines += _table(GROUPS, [g | {"worst_run": Path(g["worst_run"]).name} for g in groups])
+    if versus:
+        lines += ["", f"against {versus[0]['baseline']}:", *_table(VERSUS, versus)]
+        if any(v["same_seeds"] for v in versus):
+            lines.append(
+                "Paired: differences between runs of one seed, which begin with the same weights "
+                "if the networks have one shape; the surer figure then."
+            )
+    if result["pairs"]:
+        lines.append("Runs of one configuration and seed count once, as the first of them.")
+    return lines + _notes(groups)
+
+
+def _notes(summaries: Sequence[dict[str, Any]]) -> list[str]:
+    """Returns what a reader of the tables must know."""
+    left_out = sum(s["unfinished"] for s in summaries)
+    silent = sum(s["done"] + s["failed"] - s["n"] for s in summaries)
+    found = {
+        f"No interval (-) below {LEAST_RUNS} seeds of a configuration, where it would be too "
+        "narrow. Ten seeds are a good number.": any(s["interval"] is None for s in summaries),
+        "Failed runs (non-finite numbers) count with the last value they reached.": any(
+            s["failed"] for s in summaries
+        ),
+        f"{left_out} unfinished runs are left out.": left_out,
+        f"{silent} runs have no value of the metric and are left out.": silent,
+    }
+    return [note for note, holds in found.items() if holds]
+
+
+def _table(columns: Sequence[tuple[str, str]], records: Iterable[dict[str, Any]]) -> list[str]:
+    """Returns a table's lines, its head first; the first column is flush left, others right."""
+    rows = [[head for head, _ in columns]]
+    rows += [[_cell(record[key]) for _, key in columns] for record in records]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    form = "  ".join(f"{{:{'>' if i else '<'}{width}}}" for i, width in enumerate(widths))
+    return [form.format(*row).rstrip() for row in rows]
+
+
+def _cell(value: Any) -> str:
+    """Returns a number with four significant digits (whole where it is large), or [low, high]."""
+    if value is None:
+        return "-"
+    if isinstance(value, dict):
+        return f"[{_cell(value['low'])}, {_cell(value['high'])}]"
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 10_000 else f"{value:.4g}"
+    return str(value)
 
 
 # --- files ---
 
 
 def write(folder: Path, result: dict[str, Any], curves: Sequence[Curve]) -> None:
-    """Writes everything that was found, and the learning curves as numbers and as a picture."""
+    """Writes everything that was found, and the learning curves as numbers and as a picture.
+
+    Args:
+      folder: made if need be.
+      result: what `compare` returned first.
+      curves: what it returned second.
+    """
+    groups = (group | (group["interval"] or {}) for group in result["groups"])
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "compare.json", result)
-        _write_csv(folder / "groups.csv", group_rows(result))
-        _write_csv(folder / "curves.csv", curve_rows(curves))
+        _write_csv(folder / "groups.csv", GROUPS_CSV, groups)
+        _write_csv(folder / "curves.csv", CURVES_CSV, _curve_rows(curves))
         if curves:
-            plot(folder / "curves.png", curves, result["metric"])
+            _plot(folder / "curves.png", curves, result["metric"])
     except OSError as error:
         raise UserError(f"{folder} cannot be written: {error.strerror}.") from error
 
 
-def group_rows(result: dict[str, Any]) -> Iterable[list[Any]]:
-    """Yields groups.csv, row by row."""
-    names = ["label", "n", "done", "failed", "unfinished", "iqm", "mean", "tenth", "worst"]
-    names.append("worst_run")
-    yield [*names, "low", "high"]
-    for group in result["groups"]:
-        ends = group["interval"] or {"low": None, "high": None}
-        yield [*(group[name] for name in names), ends["low"], ends["high"]]
-
-
-def curve_rows(curves: Sequence[Curve]) -> Iterable[list[Any]]:
-    """Yields curves.csv, row by row."""
-    yield ["group", "n", "steps", "iqm", "low", "high"]
+def _curve_rows(curves: Iterable[Curve]) -> Iterator[dict[str, Any]]:
     for curve in curves:
-        band = curve.band
         for i, steps in enumerate(curve.steps):
-            ends = [None if line is None else line[i] for line in (band.low, band.high)]
-            yield [curve.label, curve.n, steps, band.iqm[i], *ends]
+            band = {k: None if v is None else v[i] for k, v in curve.band._asdict().items()}
+            yield {"group": curve.label, "n": len(curve.runs), "steps": steps} | band
 
 
-def _write_csv(path: Path, rows: Iterable[Sequence[Any]]) -> None:
-    """Writes rows; None is an empty cell."""
+def _write_csv(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> None:
+    """Writes rows; what is None or missing is an empty cell."""
     with path.open("w", newline="") as file:
-        csv.writer(file).writerows(rows)
+        writer = csv.DictWriter(file, columns, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
-def plot(path: Path, curves: Sequence[Curve], metric: str) -> None:
+def _plot(path: Path, curves: Iterable[Curve], metric: str) -> None:
     """Draws each group's IQM, its band, and its runs as thin lines."""
     import matplotlib  # most of a second
 
@@ -118,11 +188,11 @@ def plot(path: Path, curves: Sequence[Curve], metric: str) -> None:
         color = f"C{i % 10}"
         for run in curve.runs:
             axes.plot(list(run), list(run.values()), color=color, linewidth=0.5, alpha=0.4)
-        low, high = curve.band.low, curve.band.high
+        iqm, low, high = curve.band
         if low is not None and high is not None:
             axes.fill_between(curve.steps, low, high, color=color, alpha=0.2, linewidth=0)
-        label = f"{curve.label} (n = {curve.n})"
-        axes.plot(curve.steps, curve.band.iqm, color=color, linewidth=2, label=label)
+        label = f"{curve.label} (n = {len(curve.runs)})"
+        axes.plot(curve.steps, iqm, color=color, linewidth=2, label=label)
     axes.set(xlabel="control steps", ylabel=metric, title="Interquartile mean, 95% intervals")
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")

@@ -12,7 +12,8 @@ from purerl.core.records import Array, TrainState
 from purerl.ppo import distributions
 from purerl.ppo.evaluation import Progress, advance, start
 from purerl.ppo.rollout import act
-from purerl.runs import build_experiment, state_arrays
+from purerl.runs.build_experiment import Setup
+from purerl.runs.state_arrays import Leaves, flatten
 
 
 def note_modules(noted: dict[str, Array]) -> Callable[..., Any]:
@@ -34,11 +35,23 @@ def note_modules(noted: dict[str, Array]) -> Callable[..., Any]:
 
 
 def play(
-    setup: build_experiment.Setup, state: TrainState, key: Array, number: int
-) -> dict[str, Any]:
-    """Plays N whole episodes by the deterministic policy; pure. Returns arrays [T, N, ...]."""
+    setup: Setup, state: TrainState, reset_key: Array, number: int, steps: int
+) -> tuple[Progress, dict[str, Any]]:
+    """Plays N whole episodes by the deterministic policy; pure.
+
+    Args:
+      setup: the experiment's objects.
+      state: for `params` and `normalizer`, and the shape of one environment's memory.
+      reset_key: [] typed; must not be one that training uses.
+      number: N.
+      steps: T, the control steps to play.
+
+    Returns:
+      The episodes after the last step, and arrays of all steps by name, [T, N, ...]: "state" and
+      "memory" before the step, and "running", whether it belongs to the episode and left a state
+      of finite numbers.
+    """
     config, env, network, _ = setup
-    reset_key, _ = jax.random.split(key)  # as `evaluation.evaluate` does: the same beginnings
 
     def step(now: Progress, _: None) -> tuple[Progress, dict[str, Any]]:
         noted: dict[str, Array] = {}
@@ -48,10 +61,7 @@ def play(
         following = advance(env, now, action, memory)
         return following, {
             "running": ~(now.over | following.lost),
-            "observation": now.env.observation,
-            "physics": now.env.physics,
-            "metrics": now.env.metrics,
-            "task": now.env.task,
+            "state": now.env,
             "action": action,
             "reward": following.env.reward,
             "value": output.value,
@@ -59,18 +69,24 @@ def play(
             "network": noted,
         }
 
-    begin = start(config, env, state, reset_key, number)
-    return jax.lax.scan(step, begin, length=config.episode_length)[1]
+    return jax.lax.scan(step, start(config, env, state, reset_key, number), length=steps)
 
 
-def record(
-    setup: build_experiment.Setup, state: TrainState, seed: int, number: int
-) -> state_arrays.Leaves:
-    """Returns the arrays of N episodes by name, [N, T, ...], and their `length` [N]."""
-    key = derive(jax.random.key(seed), Purpose.EVALUATION)
-    rows = jax.jit(lambda state, key: play(setup, state, key, number))(state, key)
-    arrays = {
-        name: np.swapaxes(x, 0, 1) for name, x in state_arrays.flatten(rows).items() if x.size
-    }
+def record(setup: Setup, state: TrainState, seed: int, number: int) -> Leaves:
+    """Returns the arrays of N episodes by name, [N, T, ...], and their `length` [N].
+
+    Args:
+      setup: the experiment's objects.
+      state: as `play` takes it.
+      seed: of the episodes.
+      number: N.
+    """
+    # As `evaluation.evaluate` does: the same beginnings.
+    key, _ = jax.random.split(derive(jax.random.key(seed), Purpose.EVALUATION))
+    played = jax.jit(lambda s, key: play(setup, s, key, number, setup.config.episode_length)[1])
+    rows = played(state, key)
+    now = rows.pop("state")
+    rows |= {name: getattr(now, name) for name in ("observation", "physics", "metrics", "task")}
+    arrays = {name: np.swapaxes(x, 0, 1) for name, x in flatten(rows).items() if x.size}
     length = arrays.pop("running").sum(axis=1)
     return {"length": length} | {name: x[:, : length.max()] for name, x in arrays.items()}

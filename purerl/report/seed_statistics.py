@@ -1,64 +1,30 @@
 """Groups of runs: which runs belong together, what each group scored, how two groups differ."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from purerl.core.errors import UserError, unknown_name
 from purerl.report import bootstrap
-from purerl.report.bit_diff import configuration_and_seed
-from purerl.report.bootstrap import Interval
 from purerl.report.run_reader import RunRecord
 
 
 class Group(NamedTuple):
-    """Runs that differ in nothing but their seed, or in what the grouping leaves aside."""
+    """Runs that differ in nothing but their seed, or in settings that the grouping ignores."""
 
     label: str
     runs: list[RunRecord]  # each seed of a configuration once
-    strata: dict[str, list[RunRecord]]  # what the grouping leaves aside -> its runs
-
-
-class Summary(NamedTuple):
-    """What one group scored at the end of its runs."""
-
-    label: str
-    n: int  # runs that count
-    done: int
-    failed: int  # stopped by non-finite numbers; count with the last value they reached
-    unfinished: int  # do not count
-    iqm: float | None
-    interval: Interval | None
-    mean: float | None
-    worst: float | None
-    worst_run: str
-    tenth: float | None  # 10th percentile
-    runs: dict[str, float]  # path -> score
-
-
-class Versus(NamedTuple):
-    """One group against the first."""
-
-    label: str
-    baseline: str
-    difference: float  # of the IQMs
-    difference_interval: Interval | None
-    improvement: float  # probability that a run of this group beats one of the baseline
-    improvement_interval: Interval | None
-    same_seeds: int  # runs of this group with a partner of the same seed
-    paired_difference: float | None  # IQM of the differences between partners
-    paired_interval: Interval | None
+    strata: dict[str, list[RunRecord]]  # the ignored settings, as text -> their runs
 
 
 class Curve(NamedTuple):
     """A group's learning curve, at the steps that all its runs have."""
 
     label: str
-    n: int
     steps: list[int]
     band: bootstrap.Band
-    runs: list[dict[int, float]]
+    runs: list[dict[int, float]]  # steps -> value
 
 
 def differing(runs: Sequence[RunRecord]) -> dict[str, list[Any]]:
@@ -82,22 +48,20 @@ def make_groups(runs: Sequence[RunRecord], group_by: Sequence[str]) -> list[Grou
             raise UserError(unknown_name("setting", name, sorted(valid), " to group by"))
     members: dict[str, dict[str, RunRecord]] = {}
     for run in runs:
-        members.setdefault(label_of(run, by), {}).setdefault(configuration_and_seed(run), run)
-    return [
-        Group(label, list(found.values()), strata_of(list(found.values()), by))
-        for label, found in members.items()
-    ]
+        members.setdefault(_label(run, by), {}).setdefault(run.identity, run)
+    groups = {label: list(found.values()) for label, found in members.items()}
+    return [Group(label, found, _strata(found, by)) for label, found in groups.items()]
 
 
-def label_of(run: RunRecord, by: Sequence[str]) -> str:
+def _label(run: RunRecord, by: Sequence[str]) -> str:
     """Returns a group's name: the experiment, and the settings that make the difference."""
     words = [f"{name}={run.settings.get(name)}" for name in by if name != "experiment"]
     named = "experiment" in by or not words
     return " ".join([run.settings["experiment"], *words] if named else words)
 
 
-def strata_of(runs: Sequence[RunRecord], by: Sequence[str]) -> dict[str, list[RunRecord]]:
-    """Sorts a group's runs by the settings that the grouping leaves aside."""
+def _strata(runs: Iterable[RunRecord], by: Sequence[str]) -> dict[str, list[RunRecord]]:
+    """Sorts a group's runs by the settings that the grouping ignores."""
     strata: dict[str, list[RunRecord]] = {}
     for run in runs:
         rest = {k: v for k, v in run.settings.items() if k not in by}
@@ -108,108 +72,111 @@ def strata_of(runs: Sequence[RunRecord], by: Sequence[str]) -> dict[str, list[Ru
 # --- scores ---
 
 
-def score(run: RunRecord, metric: str) -> float | None:
+def _score(run: RunRecord, metric: str) -> float | None:
     """Returns a run's last value of the metric; None if it does not count."""
     curve = run.curve(metric)
     return curve[max(curve)] if curve and run.status != "unfinished" else None
 
 
-def by_seed(runs: Sequence[RunRecord], metric: str) -> dict[int, float]:
-    """Returns seed -> score of the runs of a stratum that count; it has each seed once."""
-    return {run.seed: s for run in runs if (s := score(run, metric)) is not None}
+def _scores(group: Group, metric: str) -> dict[str, dict[int, float]]:
+    """Returns stratum -> seed -> score of the runs that count; a stratum has each seed once."""
+    found = {
+        key: {run.seed: s for run in runs if (s := _score(run, metric)) is not None}
+        for key, runs in group.strata.items()
+    }
+    return {key: scores for key, scores in found.items() if scores}
 
 
-def scores(group: Group, metric: str) -> dict[str, np.ndarray]:
-    """Returns the scores of the runs that count, [n_k] for each stratum that has any."""
-    found = {key: by_seed(runs, metric) for key, runs in group.strata.items()}
-    return {key: np.array(list(values.values())) for key, values in found.items() if values}
+def _arrays(strata: dict[str, dict[int, float]]) -> list[np.ndarray]:
+    return [np.array(list(scores.values())) for scores in strata.values()]
 
 
-def summarize(group: Group, metric: str) -> Summary:
-    """Returns what a group scored."""
-    strata = list(scores(group, metric).values())
-    each = {str(r.path): s for r in group.runs if (s := score(r, metric)) is not None}
+def _as_json(**found: Any) -> dict[str, Any]:
+    """Returns results with intervals as {"low", "high"}."""
+    return {k: v._asdict() if isinstance(v, bootstrap.Interval) else v for k, v in found.items()}
+
+
+def check_scored(runs: Iterable[RunRecord], groups: Iterable[Group], metric: str) -> None:
+    """Raises UserError unless some run has the metric, and some run that counts too."""
+    names = {name for run in runs for line in run.lines for name in line}
+    names -= {"update", "steps", "wall_s", "digest"}
+    if metric not in names:
+        raise UserError(unknown_name("metric", metric, sorted(names), " in these runs"))
+    if not any(_scores(group, metric) for group in groups):
+        raise UserError(
+            f"No run that is done has a value of {metric}: let one come to its end, or choose "
+            "another --metric."
+        )
+
+
+def summarize(group: Group, metric: str) -> dict[str, Any]:
+    """Returns what a group scored at the end of its runs, as JSON values; None: nothing."""
+    strata = _arrays(_scores(group, metric))
+    each = {str(r.path): s for r in group.runs if (s := _score(r, metric)) is not None}
     values = np.array(list(each.values()))
     status = [run.status for run in group.runs]
-    known = len(values) > 0
-    return Summary(
+    return _as_json(
         label=group.label,
-        n=len(values),
+        n=len(each),  # runs that count
         done=status.count("done"),
-        failed=status.count("failed"),
-        unfinished=status.count("unfinished"),
-        iqm=float(bootstrap.pooled_iqm(strata)) if known else None,
-        interval=bootstrap.iqm_interval(strata) if known else None,
-        mean=float(values.mean()) if known else None,
-        worst=float(values.min()) if known else None,
-        worst_run=min(each, key=lambda path: each[path]) if known else "",
-        tenth=float(np.percentile(values, 10)) if known else None,
+        failed=status.count("failed"),  # they count with the last value that they reached
+        unfinished=status.count("unfinished"),  # they do not count
+        iqm=float(bootstrap.pooled_iqm(strata)) if each else None,
+        interval=bootstrap.iqm_interval(strata) if each else None,
+        mean=float(values.mean()) if each else None,
+        worst=float(values.min()) if each else None,
+        worst_run=min(each, key=lambda path: each[path]) if each else "",
+        tenth=float(np.percentile(values, 10)) if each else None,  # percentile
         runs=each,
     )
 
 
-def versus(group: Group, baseline: Group, metric: str) -> Versus | None:
-    """Compares a group with the first one; None if either has no score.
+def versus(group: Group, baseline: Group, metric: str) -> dict[str, Any] | None:
+    """Compares a group with the first one, as JSON values; None if either has no score.
 
     Strata are compared one by one where both groups have the same, else all runs with all.
+
+    Runs of equal seeds are also compared in pairs. Equal seeds give networks of one shape the same
+    initial weights, and these decide much: returns of eight seeds of brax's ant under three
+    versions of the learner correlated by 0.71 to 0.84, and the paired interval was less than half
+    as wide.
     """
-    ours, theirs = scores(group, metric), scores(baseline, metric)
+    ours, theirs = _scores(group, metric), _scores(baseline, metric)
     if not ours or not theirs:
         return None
-    xs, ys = list(ours.values()), list(theirs.values())
+    xs, ys = _arrays(ours), _arrays(theirs)
     if ours.keys() != theirs.keys():
         xs, ys = [np.concatenate(xs)], [np.concatenate(ys)]
-    pairs = paired_differences(group, baseline, metric)
-    return Versus(
+    shared = {key: ours[key].keys() & theirs[key].keys() for key in ours if key in theirs}
+    pairs = [
+        np.array([ours[key][seed] - theirs[key][seed] for seed in sorted(seeds)])
+        for key, seeds in shared.items()
+        if seeds
+    ]
+    return _as_json(
         label=group.label,
         baseline=baseline.label,
         difference=float(bootstrap.pooled_iqm(xs) - bootstrap.pooled_iqm(ys)),
         difference_interval=bootstrap.difference_interval(xs, ys),
+        # Probability that a run of this group beats one of the baseline.
         improvement=float(bootstrap.stratified_probability(xs, ys)),
         improvement_interval=bootstrap.improvement_interval(xs, ys),
-        same_seeds=sum(map(len, pairs)),
+        same_seeds=sum(map(len, pairs)),  # runs with a partner
         paired_difference=float(bootstrap.pooled_iqm(pairs)) if pairs else None,
         paired_interval=bootstrap.iqm_interval(pairs) if pairs else None,
     )
 
 
-def paired_differences(group: Group, baseline: Group, metric: str) -> list[bootstrap.Values]:
-    """Returns the group's scores minus the baseline's on the seeds that both have.
-
-    Equal seeds give networks of one shape the same initial weights, and these decide much. Returns
-    of eight seeds of brax's ant under three versions of the learner correlated by 0.71 to 0.84, and
-    the paired interval was less than half as wide.
-
-    Returns:
-      [n_k] for each stratum that both groups have.
-    """
-    found = []
-    for key in sorted(group.strata.keys() & baseline.strata.keys()):
-        ours, theirs = (by_seed(one.strata[key], metric) for one in (group, baseline))
-        seeds = sorted(ours.keys() & theirs.keys())
-        found.append(np.array([ours[seed] - theirs[seed] for seed in seeds]))
-    return [values for values in found if len(values)]
-
-
 def learning_curve(group: Group, metric: str) -> Curve | None:
     """Returns a group's learning curve; None where its runs share no step."""
-    strata = [
-        [run.curve(metric) for run in runs if score(run, metric) is not None]
+    found = [
+        [run.curve(metric) for run in runs if _score(run, metric) is not None]
         for runs in group.strata.values()
     ]
-    strata = [curves for curves in strata if curves]
-    curves = [curve for stratum in strata for curve in stratum]
-    steps = sorted(set.intersection(*(set(c) for c in curves))) if curves else []
+    strata = [curves for curves in found if curves]
+    runs = [curve for curves in strata for curve in curves]
+    steps = sorted(set.intersection(*map(set, runs))) if runs else []
     if not steps:
         return None
-    values = [np.array([[curve[s] for s in steps] for curve in stratum]) for stratum in strata]
-    return Curve(group.label, len(curves), steps, bootstrap.curve_band(values), curves)
-
-
-def check_scored(summaries: Sequence[Summary], metric: str) -> None:
-    """Raises UserError if no run has anything to compare."""
-    if not any(summary.n for summary in summaries):
-        raise UserError(
-            f"No run that is done has a value of {metric}: let one come to its end, or choose "
-            "another --metric."
-        )
+    values = [np.array([[curve[s] for s in steps] for curve in curves]) for curves in strata]
+    return Curve(group.label, steps, bootstrap.curve_band(values), runs)

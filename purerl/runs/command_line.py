@@ -23,21 +23,21 @@ WORDS = (tyro.conf.FlagConversionOff,)
 
 
 def carry_out(
-    kind: Any, command: Callable[[Any], None], prog: str, arguments: Sequence[str] | None
+    kind: Any, command: Callable[[Any], int | None], prog: str, arguments: Sequence[str] | None
 ) -> int:
     """Runs a command with its options; returns the exit code, an error being told in one line.
 
     Args:
       kind: the dataclass of its options.
-      command: called with them.
+      command: called with them; what it returns is the exit code, None: 0.
       prog: the command's words, for the help page.
       arguments: the command line; None: this process's.
     """
     try:
-        command(parse(kind, sys.argv[1:] if arguments is None else arguments, prog))
+        words = sys.argv[1:] if arguments is None else arguments
+        return command(parse(kind, words, prog)) or SUCCESS
     except (UserError, RunError) as error:
         return tell(error)
-    return SUCCESS
 
 
 def from_command_line(

@@ -57,7 +57,7 @@ def main() -> int:
             print(f"{number:<8} {speed(run):>12,.0f}  {digest[:16]}", flush=True)
             if figures(run) != figures(runs[0]):
                 same = False
-                lines = bit_diff.compare(runs[0], run).lines
+                lines = bit_diff.compare_bits(runs[0], run)["lines"]
                 print("\n".join(f"  {line}" for line in lines), flush=True)
     return 0 if same else 1
 

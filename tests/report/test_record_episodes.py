@@ -24,8 +24,7 @@ from purerl.ppo.config import Config
 from purerl.ppo.networks import MlpOptions, RecurrentOptions, mlp, recurrent
 
 ppo = Config(
-    num_steps=1600, num_envs=4, rollout_length=50, num_minibatches=2, episode_length=30,
-    action_repeat=4,
+    num_steps=1600, num_envs=4, rollout_length=50, num_minibatches=2, episode_length=30
 )
 experiment = dataclasses.replace(experiment, ppo=ppo, build_network={build}, network={network})
 """
@@ -67,8 +66,8 @@ def test_its_episodes_begin_as_those_of_an_evaluation(lstm, tmp_path):
     words = ["--episodes", "3", "--seed", "5", "--json", str(file)]
     assert evaluate.main([str(folder), *words]) == 0
     judged = json.loads(file.read_text())["metrics"]["episode_return"]["values"]
-    assert arrays["length"].tolist() == [8, 8, 8]  # actions of 4 control steps, in 30
-    assert arrays["reward"].shape == (3, 8) and arrays["action"].shape == (3, 8, 1)
+    assert arrays["length"].tolist() == [30, 30, 30]
+    assert arrays["reward"].shape == (3, 30) and arrays["action"].shape == (3, 30, 1)
     np.testing.assert_allclose(arrays["reward"].sum(axis=1), judged, rtol=1e-5)
 
 
@@ -99,7 +98,7 @@ def test_state_and_observation_are_of_one_moment(mlp):
     cart, cosine, sine, *_ = np.moveaxis(arrays["observation"], -1, 0)
     np.testing.assert_allclose(np.stack([position, np.cos(angle), np.sin(angle)]),
                                np.stack([cart, cosine, sine]), atol=1e-5)  # fmt: skip
-    np.testing.assert_allclose(np.diff(arrays["physics/time"]), 4 * 0.02, rtol=1e-4)
+    np.testing.assert_allclose(np.diff(arrays["physics/time"]), 0.02, rtol=1e-4)
     assert not any(array.size == 0 for array in arrays.values())
 
 
