@@ -23,7 +23,7 @@ from jax import Array, lax
 from jax.extend import core
 
 from purerl.exact import pallas_calls
-from purerl.exact.traces import CALLS, called_jaxpr, equations, evaluate, sub_jaxprs
+from purerl.exact.traces import CALLS, equations, evaluate, sub_jaxprs
 
 SHORT = 4  # entries of any other axis, at most
 LONGEST = 512  # of the long one: 16 registers of each thread for a vector
@@ -277,6 +277,6 @@ _RULES: dict[str, Callable[..., list[Value]]] = {
     "slice": _slice,
     "squeeze": lambda long, eqn, value: [value.reshape(_shape(eqn.outvars[0]))],
     "stack": lambda long, eqn, *values: [np.stack(values, eqn.params["axis"])],
-    **dict.fromkeys(CALLS, lambda long, eqn, *args: _evaluate(long, called_jaxpr(eqn), *args)),
+    **dict.fromkeys(CALLS, lambda long, eqn, *args: _evaluate(long, sub_jaxprs(eqn)[0], *args)),
 }
 _OF_SHORT_AXES = ("argmin", "dynamic_slice", "reduce_or", "slice", "squeeze", "stack")

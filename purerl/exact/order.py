@@ -46,11 +46,11 @@ def unordered_in(closed: core.ClosedJaxpr) -> list[ScatterSum]:
     return [
         ScatterSum(eqn.primitive.name, eqn.invars[0].aval.shape, source(eqn))
         for eqn in equations(closed)
-        if is_unordered(eqn)
+        if _is_unordered(eqn)
     ]
 
 
-def is_unordered(eqn: core.JaxprEqn) -> bool:
+def _is_unordered(eqn: core.JaxprEqn) -> bool:
     """Tells whether an equation adds or multiplies numbers in an order that nothing fixes.
 
     Sums of integers are exact in any order, and `unique_indices` promises that no terms meet.
@@ -59,7 +59,7 @@ def is_unordered(eqn: core.JaxprEqn) -> bool:
     return sums and jnp.issubdtype(eqn.invars[0].aval.dtype, jnp.inexact)
 
 
-RULE = Rule(is_unordered, lambda eqn, inputs, known, _: [ordered_scatter(eqn, inputs, known)])
+RULE = Rule(_is_unordered, lambda eqn, inputs, inside: [ordered_scatter(eqn, inputs)])
 
 
 def check_ordered(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
