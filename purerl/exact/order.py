@@ -2,8 +2,7 @@
 
 On a GPU a scatter-add is atomic: terms that meet at one address are added in the order in which
 they arrive, so two runs differ in their last bits. The rule here replaces each scatter-add whose
-indices are constants of the trace (`scatters.py`). `check_ordered` raises an error if a sum is
-left. Nothing of `fuse.py` is needed for that.
+indices follow from constants (`scatters.py`).
 """
 
 from collections.abc import Callable

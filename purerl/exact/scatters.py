@@ -119,8 +119,7 @@ def _order_of_sums(address: np.ndarray, none: int) -> tuple[np.ndarray, np.ndarr
     """
     kept = np.flatnonzero(address >= 0)
     order = kept[np.argsort(address[kept], kind="stable")]
-    touched, start, count = np.unique(address[order], return_index=True, return_counts=True)
+    touched, start, column, count = np.unique(address[order], True, True, True)
     turns = np.full((count.max(initial=0), len(touched)), none)
-    turn = np.arange(len(order)) - np.repeat(start, count)
-    turns[turn, np.repeat(np.arange(len(touched)), count)] = order
+    turns[np.arange(len(order)) - start[column], column] = order
     return touched, turns
