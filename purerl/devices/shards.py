@@ -22,7 +22,7 @@ from purerl.core.parts import WHOLE, Parts, add_in_order
 from purerl.core.records import Array, PyTree
 from purerl.devices.slices import SIDE_BY_SIDE
 from purerl.exact import pallas_calls
-from purerl.exact.traced_loops import has_loop
+from purerl.exact.traces import has_loop
 
 AXIS = "devices"
 

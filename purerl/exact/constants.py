@@ -1,4 +1,4 @@
-"""Values of a trace that are known before it runs: integers and booleans computed from constants.
+"""Integers and booleans of a trace that are known before it runs: they follow from constants.
 
 MJX computes its indices from constants with JAX operations, tens of thousands of them in a large
 model. Here numpy computes them, once: JAX would compile a small program for each shape.
@@ -6,7 +6,7 @@ model. Here numpy computes them, once: JAX would compile a small program for eac
 
 import contextlib
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -14,57 +14,33 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
-from purerl.exact.traces import CALLS, bind_equation, called_jaxpr, evaluate
-
-Known = Callable[[], np.ndarray] | None  # gives a value known while tracing
+from purerl.exact.traces import CALLS, bind_equation, evaluate, sub_jaxprs
 
 
-def known_constant(const: Any) -> Known:
-    """Gives the value of a constant of a trace, unless that is itself being traced."""
-    if isinstance(const, jax.core.Tracer) or not hasattr(const, "dtype"):
-        return None
-    # Only indices matter: keys and floating-point tables need not be fetched from the device.
-    return functools.partial(np.asarray, const) if _is_integral(const.dtype) else None
-
-
-def known_literal(literal: core.Literal) -> Known:
-    """Gives the value of a literal."""
-    return functools.partial(np.asarray, literal.val, literal.aval.dtype)
-
-
-def fold(eqn: core.JaxprEqn, known: Sequence[Known]) -> list[Known]:
-    """Says how to compute each result of an equation, if ever asked; None if it is not known."""
-    integral = [_is_integral(v.aval.dtype) for v in eqn.outvars]
-    unknown: list[Known] = [None] * len(integral)
-    if eqn.effects or not any(integral):
-        return unknown
-    if None in known or not all(integral):
-        # A call may return known indices among other things: a derivative's first half does.
-        return _fold_trace(called_jaxpr(eqn), known) if eqn.primitive.name in CALLS else unknown
-
-    @functools.cache
-    def compute() -> list[np.ndarray]:
-        return _compute(eqn, *(k() for k in known))
-
-    return [functools.partial(lambda i: compute()[i], i) for i in range(len(eqn.outvars))]
-
-
-def _fold_trace(closed: core.ClosedJaxpr, known_args: Sequence[Known]) -> list[Known]:
-    """Says how to compute the results of a trace."""
-    jaxpr = closed.jaxpr
-    known = dict(zip(jaxpr.constvars, map(known_constant, closed.consts), strict=True))
-    known |= dict(zip(jaxpr.invars, known_args, strict=True))
-
-    def read(atom: Any) -> Known:
-        return known_literal(atom) if isinstance(atom, core.Literal) else known[atom]
-
-    for eqn in jaxpr.eqns:
-        known |= dict(zip(eqn.outvars, fold(eqn, [read(v) for v in eqn.invars]), strict=True))
-    return [read(v) for v in jaxpr.outvars]
+def is_known(value: Any) -> bool:
+    """Tells whether a value is an array of integers or booleans that is not being traced."""
+    traced = isinstance(value, jax.core.Tracer)
+    return not traced and hasattr(value, "dtype") and _is_integral(value.dtype)
 
 
 def _is_integral(dtype: Any) -> bool:
     return jnp.issubdtype(dtype, jnp.integer) or dtype == jnp.bool_
+
+
+def as_value(x: Any, dtype: Any) -> Any:
+    """Returns a constant of a trace as it is, but a Python number as one of numpy, if integral."""
+    return x if hasattr(x, "dtype") or not _is_integral(dtype) else np.asarray(x, dtype)[()]
+
+
+def fold(eqn: core.JaxprEqn, *inputs: Any) -> list:
+    """Returns the results of an equation that are known; of the others nothing that is."""
+    integral = [_is_integral(v.aval.dtype) for v in eqn.outvars]
+    if not eqn.effects and all(integral) and all(map(is_known, inputs)):
+        return _compute(eqn, *map(np.asarray, inputs))
+    if not eqn.effects and any(integral) and eqn.primitive.name in CALLS:
+        # A call may return known indices among other things: a derivative's first half does.
+        return evaluate(sub_jaxprs(eqn)[0], fold, as_value, *inputs)
+    return [None] * len(integral)
 
 
 def on_cpu() -> contextlib.AbstractContextManager:
@@ -79,7 +55,7 @@ def _compute(eqn: core.JaxprEqn, *values: np.ndarray) -> list[np.ndarray]:
     """Computes one equation of known inputs."""
     rule = _RULES.get(eqn.primitive.name)
     if eqn.primitive.name in CALLS:
-        outputs = evaluate(called_jaxpr(eqn), _compute, np.asarray, *values)
+        outputs = evaluate(sub_jaxprs(eqn)[0], _compute, np.asarray, *values)
     elif rule and all(_is_integral(v.dtype) for v in values):
         outputs = [rule(eqn.params, *values)]
     else:
@@ -88,24 +64,17 @@ def _compute(eqn: core.JaxprEqn, *values: np.ndarray) -> list[np.ndarray]:
     return [np.asarray(x, v.aval.dtype) for x, v in zip(outputs, eqn.outvars, strict=True)]
 
 
+# --- a rule for each primitive: (parameters, *inputs) -> output ---
+
+
 def _broadcast(p: dict, x: np.ndarray) -> np.ndarray:
-    shape = [1] * len(p["shape"])
-    for size, place in zip(x.shape, p["broadcast_dimensions"], strict=True):
-        shape[place] = size
-    return np.broadcast_to(x.reshape(shape), p["shape"])
+    new = [i for i in range(len(p["shape"])) if i not in p["broadcast_dimensions"]]
+    return np.broadcast_to(np.expand_dims(x, new), p["shape"])
 
 
 def _slice(p: dict, x: np.ndarray) -> np.ndarray:
     strides = p["strides"] or (1,) * x.ndim
-    limits = zip(p["start_indices"], p["limit_indices"], strides, strict=True)
-    return x[tuple(slice(*s) for s in limits)]
-
-
-def _iota(p: dict) -> np.ndarray:
-    shape = [1] * len(p["shape"])
-    shape[p["dimension"]] = -1
-    counted = np.arange(p["shape"][p["dimension"]], dtype=p["dtype"])
-    return np.broadcast_to(counted.reshape(shape), p["shape"])
+    return x[tuple(map(slice, p["start_indices"], p["limit_indices"], strides))]
 
 
 def _cumulative_sum(p: dict, x: np.ndarray) -> np.ndarray:
@@ -119,10 +88,6 @@ def _remainder(p: dict, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.where(y == 0, x, np.fmod(x, np.where(y == 0, 1, y)))
 
 
-def _select(p: dict, which: np.ndarray, *cases: np.ndarray) -> np.ndarray:
-    return np.choose(which.astype(np.int32), cases)
-
-
 # Integer arithmetic wraps around in numpy as in XLA.
 _ELEMENTWISE = {
     "add": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative, "sign": np.sign,
@@ -133,11 +98,16 @@ _ELEMENTWISE = {
 _RULES: dict[str, Callable[..., np.ndarray]] = {
     name: functools.partial(lambda f, p, *values: f(*values), function)
     for name, function in _ELEMENTWISE.items()
+} | {
+    "broadcast_in_dim": _broadcast,
+    "concatenate": lambda p, *xs: np.concatenate(xs, p["dimension"]),
+    "convert_element_type": lambda p, x: x.astype(p["new_dtype"]),
+    "cumsum": _cumulative_sum,
+    "iota": lambda p: np.indices(p["shape"], p["dtype"])[p["dimension"]],
+    "rem": _remainder,
+    "reshape": lambda p, x: x.reshape(p["new_sizes"]),
+    "select_n": lambda p, which, *cases: np.choose(which.astype(np.int32), cases),
+    "slice": _slice,
+    "squeeze": lambda p, x: np.squeeze(x, p["dimensions"]),
+    "transpose": lambda p, x: np.transpose(x, p["permutation"]),
 }
-_RULES |= {"broadcast_in_dim": _broadcast, "slice": _slice, "rem": _remainder, "select_n": _select}
-_RULES |= {"iota": _iota, "cumsum": _cumulative_sum}
-_RULES["reshape"] = lambda p, x: x.reshape(p["new_sizes"])
-_RULES["convert_element_type"] = lambda p, x: x.astype(p["new_dtype"])
-_RULES["squeeze"] = lambda p, x: np.squeeze(x, p["dimensions"])
-_RULES["transpose"] = lambda p, x: np.transpose(x, p["permutation"])
-_RULES["concatenate"] = lambda p, *xs: np.concatenate(xs, p["dimension"])

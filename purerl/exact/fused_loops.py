@@ -1,9 +1,8 @@
 """Loops over a few numbers and one long axis on a GPU, each as one kernel.
 
-In every round MJX's line search adds up three numbers of each constraint, for three points, and
-chooses between the points. XLA makes four kernels of a round, and each waits for the one before.
-Here one warp makes all rounds of an environment and keeps all arrays in its registers. It computes
-the trace of the loop's body, equation by equation. If there is no rule for an equation, the loop is
+XLA makes four kernels of each round of MJX's line search, and each waits for the one before. Here
+one warp makes all rounds of an environment and keeps all arrays in its registers. It computes the
+trace of the loop's body, equation by equation. If there is no rule for an equation, the loop is
 left to XLA (elliptic cones, equalities, friction in joints or tendons).
 
 A value of the trace is an object array of the same rank. Its entries are numbers. If one of its
@@ -23,7 +22,7 @@ from jax import Array, lax
 from jax.extend import core
 
 from purerl.exact import pallas_calls
-from purerl.exact.traces import CALLS, called_jaxpr, equations, evaluate, sub_jaxprs
+from purerl.exact.traces import CALLS, equations, evaluate, sub_jaxprs
 
 SHORT = 4  # entries of any other axis, at most
 LONGEST = 512  # of the long one: 16 registers of each thread for a vector
@@ -50,24 +49,25 @@ def wanted(eqn: core.JaxprEqn) -> bool:
 
 def _long_size(body: core.ClosedJaxpr) -> int | None:
     """Returns n; None if there is no long axis or more than one, or an equation without a rule."""
-    if not all(map(_has_rule, equations(body))):
-        return None
     traced = list(equations(body))
     inner = [sub for eqn in traced for sub in sub_jaxprs(eqn)]
     consts = [np.shape(const) for closed in (body, *inner) for const in closed.consts]
-    shapes = {_shape(v) for v in body.jaxpr.invars}
-    shapes |= {_shape(v) for eqn in traced for v in (*eqn.invars, *eqn.outvars)}
-    long_const = any(n > SHORT for shape in consts for n in shape)
-    if long_const or any(0 in shape for shape in shapes):
+    atoms = [*body.jaxpr.invars, *(v for eqn in traced for v in (*eqn.invars, *eqn.outvars))]
+    shapes = {_shape(v) for v in atoms}
+    if not all(map(_has_rule, traced)) or any(map(_is_long, consts)) or any(0 in s for s in shapes):
         return None
-    longer = [[n for n in shape if n > SHORT] for shape in shapes]
-    sizes = {n for found in longer for n in found}
-    one = len(sizes) == 1 and max(map(len, longer)) == 1 and max(sizes) <= LONGEST
-    return sizes.pop() if one else None
+    match list({tuple(n for n in shape if n > SHORT) for shape in shapes} - {()}):
+        case [(n,)] if n <= LONGEST:
+            return n
+    return None
 
 
 def _shape(atom: Any) -> tuple[int, ...]:
     return atom.aval.shape
+
+
+def _is_long(shape: Sequence[int]) -> bool:
+    return any(n > SHORT for n in shape)
 
 
 def _has_rule(eqn: core.JaxprEqn) -> bool:
@@ -76,9 +76,8 @@ def _has_rule(eqn: core.JaxprEqn) -> bool:
         return False
     if name == "select_n" and len(eqn.invars) > 3:  # Triton chooses between two
         return False
-    short = all(n <= SHORT for value in values for n in value.shape)
     known = name in _RULES and all(value.dtype in _DTYPES for value in values)
-    return known and (short or name not in _OF_SHORT_AXES)
+    return known and not (name in _OF_SHORT_AXES and any(_is_long(v.shape) for v in values))
 
 
 def compute(eqn: core.JaxprEqn, platform: str, *inputs: Array) -> list[Array]:
@@ -122,45 +121,44 @@ def _kernel(body: core.ClosedJaxpr, length: int, size: int, *references: Any) ->
 
 
 def _value(shape: Sequence[int], entries: Iterable[Any]) -> Value:
-    value = np.empty(tuple(shape), object)
-    for place, entry in zip(np.ndindex(value.shape), entries, strict=True):
-        value[place] = entry
-    return value
+    return np.fromiter(entries, object).reshape(tuple(shape))
 
 
 def _entries(values: Iterable[Value]) -> list[list[Array]]:
     return [list(value.flat) for value in values]
 
 
+def _short(shape: Sequence[int]) -> list[int]:
+    """Returns the shape of the value that stands for an array."""
+    return [1 if n > SHORT else n for n in shape]
+
+
 def _places(long: Long, shape: Sequence[int]) -> list[tuple[Any, ...]]:
     """Returns where each entry of a value stands in an array."""
-    short = [1 if n > SHORT else n for n in shape]
     return [
         tuple(long.lane if n > SHORT else i for n, i in zip(shape, place, strict=True))
-        for place in np.ndindex(*short)
+        for place in np.ndindex(*_short(shape))
     ]
 
 
 def _load(long: Long, ref: Any, aval: Any) -> Value:
     from jax.experimental.pallas import triton
 
-    is_long = any(n > SHORT for n in aval.shape)
-    entries = [
-        triton.load(ref.at[place], mask=long.inside, other=0) if is_long else ref[place]
-        for place in _places(long, aval.shape)
-    ]
-    if aval.dtype == jnp.bool_:
-        entries = [entry != 0 for entry in entries]
-    return _value([1 if n > SHORT else n for n in aval.shape], entries)
+    def entry(place: tuple[Any, ...]) -> Array:
+        if _is_long(aval.shape):
+            return triton.load(ref.at[place], mask=long.inside, other=0)
+        return ref[place]
+
+    entries = map(entry, _places(long, aval.shape))
+    return _value(_short(aval.shape), (x != 0 if aval.dtype == jnp.bool_ else x for x in entries))
 
 
 def _store(long: Long, ref: Any, value: Value) -> None:
     from jax.experimental.pallas import triton
 
-    is_long = any(n > SHORT for n in ref.shape)
     for place, entry in zip(_places(long, ref.shape), value.flat, strict=True):
         kept = entry.astype(ref.dtype)
-        if is_long:
+        if _is_long(ref.shape):
             kept = jnp.broadcast_to(kept, long.lane.shape)
             triton.store(ref.at[place], kept, mask=long.inside)
         else:
@@ -204,13 +202,12 @@ def _elementwise(long: Long, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
 
 
 def _sum(long: Long, eqn: core.JaxprEqn, value: Value) -> list[Value]:
+    def along(x: Array) -> Array:
+        return jnp.sum(jnp.where(long.inside, x, 0)) if x.ndim else x * long.size
+
     if any(_shape(eqn.invars[0])[axis] > SHORT for axis in eqn.params["axes"]):
-        value = _map(functools.partial(_sum_along, long), value)
+        value = _map(along, value)
     return _fold(operator.add, long, eqn, value)
-
-
-def _sum_along(long: Long, x: Array) -> Array:
-    return jnp.sum(jnp.where(long.inside, x, 0)) if x.ndim else x * long.size
 
 
 def _fold(combine: Callable, long: Long, eqn: core.JaxprEqn, value: Value) -> list[Value]:
@@ -227,15 +224,14 @@ def _argmin(long: Long, eqn: core.JaxprEqn, value: Value) -> list[Value]:
     for number, row in enumerate(others, 1):
         less = _map(lambda a, b: (a < b) | ((a != a) & (b == b)), row, least)
         least = _map(jnp.where, less, row, least)
-        place = _map(jnp.where, less, _map(lambda p, i=number: jnp.full_like(p, i), place), place)
+        place = _map(lambda yes, p, i=number: jnp.where(yes, i, p), less, place)
     return [place]
 
 
 def _broadcast(long: Long, eqn: core.JaxprEqn, value: Value) -> list[Value]:
-    shape = [1 if n > SHORT else n for n in eqn.params["shape"]]
-    spread = np.ones(len(shape), int)
+    spread = np.ones(len(eqn.params["shape"]), int)
     spread[list(eqn.params["broadcast_dimensions"])] = value.shape
-    return [np.broadcast_to(value.reshape(tuple(spread)), shape)]
+    return [np.broadcast_to(value.reshape(tuple(spread)), _short(eqn.params["shape"]))]
 
 
 def _slice(long: Long, eqn: core.JaxprEqn, value: Value) -> list[Value]:
@@ -245,20 +241,21 @@ def _slice(long: Long, eqn: core.JaxprEqn, value: Value) -> list[Value]:
 
 
 def _dynamic_slice(long: Long, eqn: core.JaxprEqn, value: Value, start: Value) -> list[Value]:
-    """One entry of [k], k short; an index beyond the ends is the end's."""
-    rows = _rows(value, 0)
-    found = rows[0]
-    for number, row in enumerate(rows[1:], 1):
-        found = _map(lambda i, a, b, n=number: jnp.where(i >= n, a, b), start, row, found)
-    return [found.reshape(1)]
+    """One entry of [k], k short."""
+    return [_choose(start, _rows(value, 0)).reshape(1)]
 
 
 def _cond(long: Long, eqn: core.JaxprEqn, index: Value, *args: Value) -> list[Value]:
     """All branches, then a choice."""
-    found, *others = (_evaluate(long, branch, *args) for branch in eqn.params["branches"])
-    for number, other in enumerate(others, 1):
-        chosen = _map(lambda i, n=number: i.astype(jnp.int32) >= n, index)
-        found = [_map(jnp.where, chosen, a, b) for a, b in zip(other, found, strict=True)]
+    found = [_evaluate(long, branch, *args) for branch in eqn.params["branches"]]
+    return [_choose(index, cases) for cases in zip(*found, strict=True)]
+
+
+def _choose(index: Value, cases: Sequence[Value]) -> Value:
+    """Returns the case that has the number `index`; if none has, the first or the last."""
+    found = cases[0]
+    for number, case in enumerate(cases[1:], 1):
+        found = _map(lambda i, a, b, n=number: jnp.where(i >= n, a, b), index, case, found)
     return found
 
 
@@ -277,6 +274,6 @@ _RULES: dict[str, Callable[..., list[Value]]] = {
     "slice": _slice,
     "squeeze": lambda long, eqn, value: [value.reshape(_shape(eqn.outvars[0]))],
     "stack": lambda long, eqn, *values: [np.stack(values, eqn.params["axis"])],
-    **dict.fromkeys(CALLS, lambda long, eqn, *args: _evaluate(long, called_jaxpr(eqn), *args)),
+    **dict.fromkeys(CALLS, lambda long, eqn, *args: _evaluate(long, sub_jaxprs(eqn)[0], *args)),
 }
 _OF_SHORT_AXES = ("argmin", "dynamic_slice", "reduce_or", "slice", "squeeze", "stack")

@@ -10,7 +10,6 @@ at least 4. Beyond n it reads an identity.
 """
 
 import functools
-from collections.abc import Callable
 from typing import Any, cast
 
 import jax
@@ -38,47 +37,27 @@ def wanted(eqn: core.JaxprEqn) -> bool:
     return small and plain and sides[0].shape[1] == 1
 
 
-def compute(eqn: core.JaxprEqn, platform: str, *inputs: Array) -> list[Array]:
-    """Computes an equation that is `wanted`, by a kernel for a platform."""
-    if eqn.primitive.name == "cholesky":
-        return [cholesky(*inputs, platform=platform)]
-    (matrix, side), p = inputs, eqn.params  # conjugate_a changes nothing of real numbers
-    halves = {"lower": p["lower"], "transposed": p["transpose_a"]}
-    return [triangular_solve(matrix, side[:, 0], **halves, platform=platform)[:, None]]
-
-
-def cholesky(matrix: Array, *, platform: str | None = None) -> Array:
-    """Returns the lower L [n, n] with L L^T = `matrix` [n, n], of which the lower half is read.
-
-    If the matrix is not positive definite, L is NaN from the first bad pivot on.
-    """
-    return _call(_cholesky_kernel, matrix.shape, matrix, platform=platform)
-
-
-def triangular_solve(
-    matrix: Array, side: Array, *, lower: bool, transposed: bool, platform: str | None = None
-) -> Array:
-    """Solves T x = `side`, where T is a triangular matrix or its transpose.
+def compute(eqn: core.JaxprEqn, platform: str, matrix: Array, *sides: Array) -> list[Array]:
+    """Computes an equation that is `wanted`, by a kernel for a platform.
 
     Args:
-      matrix: [n, n], of which only one half is read.
-      side: [n], the right-hand side.
-      lower: whether that half is the lower one.
-      transposed: whether T is the transpose.
+      eqn: a Cholesky factorisation, which reads the lower half of the matrix, or a solve.
       platform: the platform to run on.
+      matrix: [n, n], symmetric or triangular.
+      *sides: of a solve the right-hand side, [n, 1].
 
     Returns:
-      x, [n].
+      The factor [n, n], NaN from the first pivot on that is not positive; or the solution [n, 1].
     """
-    kernel = functools.partial(_solve_kernel, lower, transposed)
-    return _call(kernel, side.shape, matrix, side, platform=platform)
-
-
-def _call(kernel: Callable, shape: tuple[int, ...], *inputs: Array, platform: str | None) -> Array:
-    """Runs a kernel, which is told m, on one system."""
-    m = max(4, 1 << (shape[0] - 1).bit_length())
-    result = jax.ShapeDtypeStruct(shape, jnp.float32)
-    return pallas_calls.call(functools.partial(kernel, m), [result], *inputs, platform=platform)[0]
+    m, p = max(4, 1 << (len(matrix) - 1).bit_length()), eqn.params
+    if not sides:
+        kernel, inputs = functools.partial(_cholesky_kernel, m), [matrix]
+    else:  # conjugate_a changes nothing of real numbers
+        kernel = functools.partial(_solve_kernel, p["lower"], p["transpose_a"], m)
+        inputs = [matrix, sides[0][:, 0]]
+    result = jax.ShapeDtypeStruct(inputs[-1].shape, jnp.float32)
+    (found,) = pallas_calls.call(kernel, [result], *inputs, platform=platform)
+    return [found[:, None] if sides else found]
 
 
 def _places(m: int) -> tuple[Array, Array]:

@@ -2,8 +2,7 @@
 
 On a GPU a scatter-add is atomic: terms that meet at one address are added in the order in which
 they arrive, so two runs differ in their last bits. The rule here replaces each scatter-add whose
-indices are constants of the trace (`scatters.py`). `check_ordered` raises an error if a sum is
-left. Nothing of `fuse.py` is needed for that.
+indices follow from constants (`scatters.py`).
 """
 
 from collections.abc import Callable
@@ -46,11 +45,11 @@ def unordered_in(closed: core.ClosedJaxpr) -> list[ScatterSum]:
     return [
         ScatterSum(eqn.primitive.name, eqn.invars[0].aval.shape, source(eqn))
         for eqn in equations(closed)
-        if is_unordered(eqn)
+        if _is_unordered(eqn)
     ]
 
 
-def is_unordered(eqn: core.JaxprEqn) -> bool:
+def _is_unordered(eqn: core.JaxprEqn) -> bool:
     """Tells whether an equation adds or multiplies numbers in an order that nothing fixes.
 
     Sums of integers are exact in any order, and `unique_indices` promises that no terms meet.
@@ -59,7 +58,7 @@ def is_unordered(eqn: core.JaxprEqn) -> bool:
     return sums and jnp.issubdtype(eqn.invars[0].aval.dtype, jnp.inexact)
 
 
-RULE = Rule(is_unordered, lambda eqn, inputs, known, _: [ordered_scatter(eqn, inputs, known)])
+RULE = Rule(_is_unordered, lambda eqn, inputs, inside: [ordered_scatter(eqn, inputs)])
 
 
 def check_ordered(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:

@@ -15,22 +15,17 @@ INTERPRETED = "interpreted"
 GPUS = ("gpu", INTERPRETED)
 
 
-def target(platform: str | None) -> str:
-    """Returns the platform that is asked for; of None, that of JAX's default backend."""
-    return platform or jax.default_backend()
-
-
 def can_run(platform: str | None = None) -> bool:
-    """Tells whether a platform is a GPU, and JAX has Triton's part of Pallas.
+    """Tells whether a platform (None: JAX's default backend) runs kernels of our own.
 
-    JAX means to remove it; then XLA's kernels and loops are used.
+    It is a GPU, and JAX has Triton's part of Pallas. JAX means to remove that; then XLA's kernels
+    and loops are used.
     """
-    if target(platform) not in GPUS:
-        return False
     try:
-        return importlib.util.find_spec("jax.experimental.pallas.triton") is not None
+        there = importlib.util.find_spec("jax.experimental.pallas.triton") is not None
     except ModuleNotFoundError:  # not even what it is a part of
-        return False
+        there = False
+    return there and (platform or jax.default_backend()) in GPUS
 
 
 def call(
@@ -47,7 +42,7 @@ def call(
       results: their shapes and dtypes.
       *inputs: the arrays to read.
       grid: number of warps along each axis; `pallas.program_id` tells a kernel which it is.
-      platform: the platform to run on; only a GPU runs the kernel, others interpret it.
+      platform: None: JAX's default backend. A GPU runs the kernel, others interpret it.
     """
     # Imported here: it takes 0.1 s, and a run on CPUs need not wait for it.
     from jax.experimental import pallas
@@ -58,7 +53,7 @@ def call(
         results,
         grid=grid,
         compiler_params=triton.CompilerParams(num_warps=1),
-        interpret=target(platform) != "gpu",
+        interpret=(platform or jax.default_backend()) != "gpu",
     )(*inputs)
 
 
@@ -79,10 +74,7 @@ def _copy_kernel(*references: Any) -> None:
 
     half = len(references) // 2
     place = pallas.program_id(0) * BLOCK + jnp.arange(BLOCK)
-    inside = [place < reference.shape[0] for reference in references[:half]]
-    read = [
-        triton.load(reference.at[place], mask=mask)
-        for reference, mask in zip(references[:half], inside, strict=True)
-    ]
-    for reference, values, mask in zip(references[half:], read, inside, strict=True):
-        triton.store(reference.at[place], values, mask=mask)
+    masks = [place < source.shape[0] for source in references[:half]]
+    read = [triton.load(x.at[place], mask=m) for x, m in zip(references, masks, strict=False)]
+    for result, values, mask in zip(references[half:], read, masks, strict=True):
+        triton.store(result.at[place], values, mask=mask)

@@ -9,23 +9,20 @@ from jax.extend import core
 
 from purerl.exact import fuse as optimisation
 from purerl.exact import order
-from purerl.exact.pallas_calls import target
 from purerl.exact.walk import rewrite_trace
 
 
 def rewrite(f: Callable, *, platform: str | None = None, fuse: bool = True) -> Callable:
     """Returns a function with the values of `f` up to rounding, whose sums have a fixed order.
 
-    It is traced and rewritten once for each set of shapes, as by `jax.jit`, and can be called under
-    `jit`, `vmap`, `scan` and from any code. To differentiate, rewrite the derivative:
-    `rewrite(jax.grad(f))`. The derivative of `rewrite(f)` has the right values, but its own sums
-    have no fixed order until it is rewritten, too.
+    It is traced once for each set of shapes, as by `jax.jit`, and can be called from any JAX code.
+    The derivative of `rewrite(f)` has the right values, but the order of its own sums is fixed only
+    in `rewrite(jax.grad(f))`.
 
     Args:
-      f: a pure function; its arguments and results are pytrees of arrays. Indices of its sums have
-        to be constants: computed from the arrays that it closes over, not from its arguments.
-      platform: the platform of the device that will run it, "cpu" or "gpu"; None: that of JAX's
-        default backend when it is traced.
+      f: a pure function of pytrees of arrays. Indices of its sums have to follow from constants:
+        from the arrays that it closes over, not from its arguments.
+      platform: where it will run, "cpu" or "gpu"; None: JAX's default backend when it is traced.
       fuse: whether to optimise as well (`fuse.py`); the order is fixed in either case.
 
     Raises:
@@ -41,7 +38,7 @@ def rewrite(f: Callable, *, platform: str | None = None, fuse: bool = True) -> C
             return f(*args, **kwargs)
 
         closed, shapes = jax.make_jaxpr(flat, return_shape=True)(*leaves)
-        rules = optimisation.rules(target(platform)) if fuse else []
+        rules = optimisation.rules(platform or jax.default_backend()) if fuse else []
         closed = order.check_ordered(rewrite_trace(closed, [order.RULE, *rules]))
         results = core.jaxpr_as_fun(closed)(*leaves)
         return jax.tree.unflatten(jax.tree.structure(shapes), results)

@@ -1,32 +1,37 @@
 """Scatters with known indices, computed by gathers: so the sums of a scatter-add have an order."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from jax.extend import core
 
-from purerl.exact.constants import Known
+from purerl.exact.constants import is_known
 from purerl.exact.traces import source
 
 _FEW_TERMS = 4
 
 
-def ordered_scatter(eqn: core.JaxprEqn, inputs: list, known: list[Known]) -> Array:
+def ordered_scatter(eqn: core.JaxprEqn, inputs: Sequence) -> Array:
     """Computes a scatter-add by gathers, which are added in the order of the updates.
+
+    Args:
+      eqn: the equation.
+      inputs: operand, indices and updates.
 
     Raises:
       RuntimeError: the primitive is not a scatter-add, or its indices are not known.
     """
-    operand, _, updates = inputs
-    if known[1] is None or "add" not in eqn.primitive.name:
-        why = "its indices are known only while running" if known[1] is None else "it is no sum"
+    operand, indices, updates = inputs
+    if not is_known(indices) or "add" not in eqn.primitive.name:
+        why = "it is no sum" if is_known(indices) else "its indices are known only while running"
         raise RuntimeError(
             f"A {eqn.primitive.name} traced at {source(eqn)} cannot be given a fixed order: {why}. "
             "Compute the indices of a sum from constants; of MJX, change the model or ask for "
             "fewer readings, so that it is not needed."
         )
-    addresses = _addresses(eqn, np.asarray(known[1]()))
-    touched, turns = _order_of_sums(addresses, updates.size)
+    touched, turns = _order_of_sums(_addresses(eqn, indices), updates.size)
     whole, flat = jnp.reshape(operand, (-1,)), jnp.reshape(updates, (-1,))
     if (turns == updates.size).any():
         flat = jnp.concatenate([flat, jnp.zeros(1, flat.dtype)])
@@ -50,14 +55,14 @@ def puts(eqn: core.JaxprEqn) -> bool:
     return eqn.primitive.name == "scatter" and eqn.params["update_jaxpr"] is None
 
 
-def gathered_scatter(eqn: core.JaxprEqn, inputs: list, known: list[Known]) -> Array:
+def gathered_scatter(eqn: core.JaxprEqn, inputs: Sequence) -> Array:
     """Computes a scatter that `puts`, with known indices, by one gather.
 
     XLA has two kernels for a scatter, one of them a copy, and neither is fused with others. It
     leaves open which of several updates at one place is kept; here it is the last.
     """
-    operand, _, updates = inputs
-    addresses = _addresses(eqn, np.asarray(known[1]()))
+    operand, indices, updates = inputs
+    addresses = _addresses(eqn, indices)
     kept = np.flatnonzero(addresses >= 0)
     if not kept.size:
         return operand
@@ -78,56 +83,43 @@ def _take(flat: Array, index: np.ndarray) -> Array:
 
 
 def _addresses(eqn: core.JaxprEqn, indices: np.ndarray) -> np.ndarray:
-    """Returns for each update the flat address it is added to; -1 if it is dropped.
+    """Returns for each update the flat address it is added to; below 0 if it is dropped.
 
     This is XLA's definition of a scatter: each index vector says where a window of updates starts.
     A window that does not fit is dropped whole or, in mode CLIP, moved until it fits.
     """
-    shape, updates = eqn.invars[0].aval.shape, eqn.invars[2].aval
-    d = eqn.params["dimension_numbers"]
-    batch_axes = [i for i in range(len(updates.shape)) if i not in d.update_window_dims]
-    batch = tuple(updates.shape[i] for i in batch_axes)
+    shape, updates = eqn.invars[0].aval.shape, eqn.invars[2].aval.shape
+    d, indices = eqn.params["dimension_numbers"], np.asarray(indices)
     absent = (*d.inserted_window_dims, *d.operand_batching_dims)
-    axis_of = dict(
-        zip([i for i in range(len(shape)) if i not in absent], d.update_window_dims, strict=True)
-    )
-    starts = np.zeros((len(shape), *batch), np.int64)
-    for column, dim in enumerate(d.scatter_dims_to_operand_dims):
-        starts[dim] = indices[..., column]
+    window = [updates[axis] for axis in d.update_window_dims]
+    sizes = np.ones(len(shape), np.int64)
+    sizes[[i for i in range(len(shape)) if i not in absent]] = window
+    batch = indices.shape[:-1]
+    starts = np.zeros((*batch, len(shape)), np.int64)
+    starts[..., list(d.scatter_dims_to_operand_dims)] = indices
     for dim, axis in zip(d.operand_batching_dims, d.scatter_indices_batching_dims, strict=True):
-        starts[dim] = np.indices(batch)[axis]
-    sizes = [updates.shape[axis_of[i]] if i in axis_of else 1 for i in range(len(shape))]
-    room = (np.array(shape) - sizes).reshape(-1, *[1] * len(batch)).astype(np.int64)
+        starts[..., dim] = np.indices(batch)[axis]
+    room = np.array(shape, np.int64) - sizes
     if eqn.params["mode"] == lax.GatherScatterMode.CLIP:
         starts = np.clip(starts, 0, room)
-    fits = ((starts >= 0) & (starts <= room)).all(0)
-    address = np.zeros(updates.shape, np.int64)
-    steps = np.cumprod([1, *shape[:0:-1]])[::-1] if shape else []
-    spread = tuple(i for i in range(len(updates.shape)) if i not in batch_axes)
-    for dim, step in enumerate(steps):
-        address += step * np.expand_dims(starts[dim], spread)
-        if dim in axis_of:
-            along = [1] * len(updates.shape)
-            along[axis_of[dim]] = sizes[dim]
-            address += step * np.arange(sizes[dim]).reshape(along)
-    return np.where(np.expand_dims(fits, spread), address, -1).reshape(-1)
+    fits = ((starts >= 0) & (starts <= room)).all(axis=-1)
+    steps = np.array([np.prod(shape[i + 1 :], dtype=np.int64) for i in range(len(shape))], np.int64)
+    first = np.where(fits, starts @ steps, -np.prod(shape, dtype=np.int64))
+    inside = np.tensordot(steps, np.indices(sizes), 1).reshape(window)
+    address = np.add.outer(first, inside)
+    window_axes = range(len(batch), address.ndim)
+    return np.moveaxis(address, window_axes, d.update_window_dims).reshape(-1)
 
 
 def _order_of_sums(address: np.ndarray, none: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sorts updates by the address that they are added to.
+    """Sorts updates by the address [updates] that they are added to; `none` stands for no update.
 
-    Args:
-      address: [updates]; -1 where an update is dropped.
-      none: the number that stands for no update.
-
-    Returns:
-      The addresses that receive an update, [touched], ascending; and for each the number of its
-      k-th update, [turns, touched].
+    Returns the addresses that receive an update, [touched], ascending; and for each the number of
+    its k-th update, [turns, touched].
     """
     kept = np.flatnonzero(address >= 0)
     order = kept[np.argsort(address[kept], kind="stable")]
-    touched, start, count = np.unique(address[order], return_index=True, return_counts=True)
+    touched, start, column, count = np.unique(address[order], True, True, True)
     turns = np.full((count.max(initial=0), len(touched)), none)
-    turn = np.arange(len(order)) - np.repeat(start, count)
-    turns[turn, np.repeat(np.arange(len(touched)), count)] = order
+    turns[np.arange(len(order)) - start[column], column] = order
     return touched, turns

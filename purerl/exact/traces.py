@@ -8,29 +8,20 @@ import jax
 import jax.numpy as jnp
 from jax.extend import core
 
-# Primitives that only call one jaxpr: their body can be run in place.
-CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
-CALLS |= {"checkpoint": "jaxpr", "remat2": "jaxpr", "remat": "jaxpr"}
 CUSTOM_DERIVATIVES = ("custom_jvp_call", "custom_vjp_call")
-CALLS |= dict.fromkeys(CUSTOM_DERIVATIVES, "call_jaxpr")
-
-
-def called_jaxpr(eqn: core.JaxprEqn) -> core.ClosedJaxpr:
-    """Returns the trace that an equation of `CALLS` calls."""
-    inner = eqn.params[CALLS[eqn.primitive.name]]
-    return inner if isinstance(inner, core.ClosedJaxpr) else core.ClosedJaxpr(inner, ())
+# Primitives that only call one trace: its equations can be run in place.
+CALLS = ("jit", "closed_call", "core_call", "checkpoint", *CUSTOM_DERIVATIVES)
 
 
 def sub_jaxprs(eqn: core.JaxprEqn) -> list[core.ClosedJaxpr]:
-    """Returns the traces inside one equation (loop bodies, branches, called functions)."""
-    found = []
-    for value in eqn.params.values():
-        for item in value if isinstance(value, tuple | list) else (value,):
-            if isinstance(item, core.ClosedJaxpr):
-                found.append(item)
-            elif isinstance(item, core.Jaxpr):
-                found.append(core.ClosedJaxpr(item, ()))
-    return found
+    """Returns the traces inside one equation (loop bodies, branches, a called function)."""
+    params = (x if isinstance(x, tuple | list) else (x,) for x in eqn.params.values())
+    traces = (item for items in params for item in items)
+    return [
+        core.ClosedJaxpr(x, ()) if isinstance(x, core.Jaxpr) else x
+        for x in traces
+        if isinstance(x, core.Jaxpr | core.ClosedJaxpr)
+    ]
 
 
 def equations(closed: core.ClosedJaxpr) -> Iterator[core.JaxprEqn]:
@@ -39,6 +30,18 @@ def equations(closed: core.ClosedJaxpr) -> Iterator[core.JaxprEqn]:
         yield eqn
         for sub in sub_jaxprs(eqn):
             yield from equations(sub)
+
+
+def has_loop(closed: core.ClosedJaxpr) -> bool:
+    """Tells whether a trace has a loop at any depth.
+
+    A scan whose rounds are all written out is none.
+    """
+    return any(
+        eqn.primitive.name == "while"
+        or (eqn.primitive.name == "scan" and eqn.params["unroll"] < eqn.params["length"])
+        for eqn in equations(closed)
+    )
 
 
 def source(eqn: core.JaxprEqn) -> str:

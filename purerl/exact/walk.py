@@ -1,8 +1,8 @@
 """Runs a trace once more, with other operations in the place of some equations.
 
 The walk itself knows no replacement: `order.py` and `fuse.py` have the rules. It goes into loops,
-branches and called functions where a rule wants something inside, and it computes beforehand the
-integers that a rule asks for (`constants.py`).
+branches and called functions where a rule wants something inside. Integers that follow from
+constants are numpy arrays on the way, and not traced (`constants.py`), so a rule can read them.
 """
 
 import functools
@@ -11,34 +11,34 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jax.extend import core
 
-from purerl.exact.constants import Known, fold, known_constant, known_literal
+from purerl.exact.constants import as_value, fold, is_known
 from purerl.exact.traces import (
     CALLS,
     CUSTOM_DERIVATIVES,
     bind_equation,
-    called_jaxpr,
+    evaluate,
     sub_jaxprs,
     with_own_derivative,
 )
 
-Inside = Callable[..., list]  # (trace, known_args, *args) -> results: the same walk, further in
+Inside = Callable[..., list]  # (trace, *args) -> results: the same walk, further in
 
 
 class Rule(NamedTuple):
     """Which equations are replaced, and by what."""
 
     wants: Callable[[core.JaxprEqn], bool]
-    # (wanted equation, inputs, known inputs, inside) -> outputs; None: it is not replaced after all
-    replace: Callable[[core.JaxprEqn, list, list[Known], Inside], list | None]
+    # (wanted equation, inputs, inside) -> outputs; None: it is not replaced after all
+    replace: Callable[[core.JaxprEqn, Sequence, Inside], list | None]
 
 
 def rewrite_trace(closed: core.ClosedJaxpr, rules: Sequence[Rule]) -> core.ClosedJaxpr:
     """Returns a trace with equations replaced, each by the first rule that applies to it."""
-    unknown = [None] * len(closed.jaxpr.invars)
-    run = functools.partial(_run, tuple(rules), {}, closed, unknown)
+    run = functools.partial(_run, tuple(rules), {}, closed)
     return _prune(jax.make_jaxpr(run)(*closed.in_avals))
 
 
@@ -53,52 +53,22 @@ def _prune(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
     return core.ClosedJaxpr(closed.jaxpr.replace(eqns=kept[::-1]), closed.consts)
 
 
-def _run(
-    rules: tuple[Rule, ...],
-    shared: dict,
-    closed: core.ClosedJaxpr,
-    known_args: Sequence[Known],
-    *args: Array,
-) -> list[Array]:
-    """Runs a trace.
-
-    Args:
-      rules: what to replace.
-      shared: the constants of the whole program by content, so that each stands there once.
-      closed: the trace.
-      known_args: for each argument, how to compute its value while tracing; None if unknown.
-      *args: the arguments.
-    """
-    jaxpr = _prune(closed).jaxpr
-    values: dict[Any, Any] = {}
-    known: dict[Any, Known] = {}
-
-    def read(atom):
-        if isinstance(atom, core.Literal):
-            return atom.val
-        if atom not in values:
-            value = known[atom]()
-            content = (value.shape, value.dtype.str, value.tobytes())
-            values[atom] = shared.setdefault(content, value)
-        return values[atom]
-
-    def read_known(atom):
-        return known_literal(atom) if isinstance(atom, core.Literal) else known.get(atom)
-
-    values.update(zip(jaxpr.constvars, closed.consts, strict=True))
-    known.update(zip(jaxpr.constvars, map(known_constant, closed.consts), strict=True))
-    values.update(zip(jaxpr.invars, args, strict=True))
-    known.update(zip(jaxpr.invars, known_args, strict=True))
+def _run(rules: tuple[Rule, ...], shared: dict, closed: core.ClosedJaxpr, *args: Any) -> list:
+    """Runs a trace; `shared` has known arrays by content, so that a program has each once."""
     inside = functools.partial(_run, rules, shared)
-    for eqn in jaxpr.eqns:
-        known_inputs = [read_known(v) for v in eqn.invars]
-        folded = fold(eqn, known_inputs)
-        known.update(zip(eqn.outvars, folded, strict=True))
-        if folded and None not in folded:
-            continue
-        outputs = _apply(rules, eqn, [read(v) for v in eqn.invars], known_inputs, inside)
-        values.update(zip(eqn.outvars, outputs, strict=True))
-    return [read(v) for v in jaxpr.outvars]
+
+    def share(value: np.ndarray) -> Any:
+        content = value.shape, value.dtype.str, value.tobytes()
+        return shared.setdefault(content, value[()])
+
+    def apply(eqn: core.JaxprEqn, *inputs: Any) -> list:
+        known = [share(np.asarray(x)) if is_known(x) else None for x in fold(eqn, *inputs)]
+        if known and all(x is not None for x in known):
+            return known
+        found = _apply(rules, eqn, inputs, inside)
+        return [y if x is None else x for x, y in zip(known, found, strict=True)]
+
+    return evaluate(_prune(closed), apply, as_value, *args)
 
 
 def _is_wanted(rules: tuple[Rule, ...], eqn: core.JaxprEqn) -> bool:
@@ -109,33 +79,37 @@ def _is_wanted(rules: tuple[Rule, ...], eqn: core.JaxprEqn) -> bool:
 
 
 def _apply(
-    rules: tuple[Rule, ...], eqn: core.JaxprEqn, inputs: list, known: list[Known], inside: Inside
-) -> list:
+    rules: tuple[Rule, ...], eqn: core.JaxprEqn, inputs: Sequence, inside: Inside
+) -> Sequence:
     """Runs one equation by the first rule that applies, or as it is with its inside rewritten."""
     name = eqn.primitive.name
     if not _is_wanted(rules, eqn):
         return bind_equation(eqn, *inputs)
     for rule in rules:
-        outputs = rule.replace(eqn, inputs, known, inside) if rule.wants(eqn) else None
+        outputs = rule.replace(eqn, inputs, inside) if rule.wants(eqn) else None
         if outputs is not None:
             return outputs
     if name in CUSTOM_DERIVATIVES:
-        body = functools.partial(inside, called_jaxpr(eqn), known)
-        return with_own_derivative(eqn, lambda *x: body(*x), inputs)
+        return with_own_derivative(eqn, functools.partial(_call, eqn, inputs, inside), inputs)
     if name in CALLS:
-        return inside(called_jaxpr(eqn), known, *inputs)
+        return inside(sub_jaxprs(eqn)[0], *inputs)
     if name in _LOOPS:
-        return _LOOPS[name](eqn.params, inputs, known, inside)
+        return _LOOPS[name](eqn.params, inputs, inside)
     return bind_equation(eqn, *inputs)
 
 
-def scan(params: dict, inputs: list, known: list[Known], inside: Inside) -> list:
+def _call(eqn: core.JaxprEqn, inputs: Sequence, inside: Inside, *traced: Array) -> list:
+    """Calls a function on its inputs as they are traced now, but for those that are known."""
+    args = [x if is_known(x) else y for x, y in zip(inputs, traced, strict=True)]
+    return inside(sub_jaxprs(eqn)[0], *args)
+
+
+def scan(params: dict, inputs: Sequence, inside: Inside) -> list:
     """`lax.scan` with a rewritten body."""
     n, m = scan_sizes(params)
-    known_body = known[:n] + [None] * (len(inputs) - n)
 
     def step(carry, x):
-        out = inside(params["jaxpr"], known_body, *inputs[:n], *carry, *x)
+        out = inside(params["jaxpr"], *inputs[:n], *carry, *x)
         return out[:m], out[m:]
 
     carry, xs = list(inputs[n : n + m]), list(inputs[n + m :])
@@ -153,33 +127,28 @@ def scan_sizes(params: dict) -> tuple[int, int]:
     return len(consts), len(carry)
 
 
-def while_parts(
-    params: dict, inputs: list, known: list[Known], inside: Inside
-) -> tuple[Callable, Callable, list]:
+def while_parts(params: dict, inputs: Sequence, inside: Inside) -> tuple[Callable, Callable, list]:
     """Returns the rewritten condition and body of a `while`, and what it starts from."""
     n, m = params["cond_nconsts"], params["body_nconsts"]
-    carry = list(inputs[n + m :])
-    unknown = [None] * len(carry)
 
-    def condition(c):
-        return inside(params["cond_jaxpr"], known[:n] + unknown, *inputs[:n], *c)[0]
+    def condition(carry):
+        return inside(params["cond_jaxpr"], *inputs[:n], *carry)[0]
 
-    def body(c):
-        return inside(params["body_jaxpr"], known[n : n + m] + unknown, *inputs[n : n + m], *c)
+    def body(carry):
+        return inside(params["body_jaxpr"], *inputs[n : n + m], *carry)
 
-    return condition, body, carry
+    return condition, body, list(inputs[n + m :])
 
 
-def _while(params: dict, inputs: list, known: list[Known], inside: Inside) -> list:
+def _while(params: dict, inputs: Sequence, inside: Inside) -> list:
     """`lax.while_loop` with a rewritten condition and body."""
-    return lax.while_loop(*while_parts(params, inputs, known, inside))
+    return lax.while_loop(*while_parts(params, inputs, inside))
 
 
-def _cond(params: dict, inputs: list, known: list[Known], inside: Inside) -> list:
+def _cond(params: dict, inputs: Sequence, inside: Inside) -> list:
     """`lax.switch` with rewritten branches."""
-    branches = [functools.partial(inside, b, known[1:]) for b in params["branches"]]
-    index = inputs[0].astype(jnp.int32) if hasattr(inputs[0], "astype") else inputs[0]
-    return lax.switch(index, branches, *inputs[1:])
+    branches = [functools.partial(inside, b, *inputs[1:]) for b in params["branches"]]
+    return lax.switch(jnp.asarray(inputs[0], jnp.int32), branches)
 
 
 _LOOPS = {"scan": scan, "while": _while, "cond": _cond}

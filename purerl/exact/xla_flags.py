@@ -14,10 +14,9 @@ other. That changes no bit (`docs/gpu.md`).
 
 import os
 
-LEVEL = "xla_gpu_autotune_level"
 # What XLA does instead of timing.
 RULES = {
-    LEVEL: "0",
+    "xla_gpu_autotune_level": "0",
     "xla_gpu_enable_triton_gemm": "false",
     "xla_gpu_experimental_enable_fusion_block_level_rewriter": "true",
 }
@@ -30,7 +29,7 @@ GRAPHS = {
 PASSES = "xla_disable_hlo_passes"
 UNEQUAL_PASSES = "spmd-simplify,dot-merger"
 FIXING_FLAGS = (
-    f"{LEVEL}=0",
+    "xla_gpu_autotune_level=0",
     "xla_gpu_deterministic_ops=true",
     "xla_gpu_exclude_nondeterministic_ops=true",
 )
@@ -63,6 +62,6 @@ def equal_passes() -> dict[str, str]:
 
     The option replaces the one in XLA_FLAGS, so it contains the user's passes too.
     """
-    flags = (flag.lstrip("-").partition("=") for flag in os.environ.get("XLA_FLAGS", "").split())
-    users = [value for name, _, value in flags if name == PASSES]
+    flags = os.environ.get("XLA_FLAGS", "").split()
+    users = [flag.partition("=")[2] for flag in flags if flag.startswith(f"--{PASSES}=")]
     return {PASSES: ",".join([UNEQUAL_PASSES, *users])}

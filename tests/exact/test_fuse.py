@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxpr_as_fun
 
-from purerl.exact import traced_loops
-from purerl.exact.traced_loops import WRITTEN_OUT
+from purerl.exact import fuse
+from purerl.exact.fuse import WRITTEN_OUT
 from purerl.physics.interface import Physics
 from tests import exact as shared
 from tests import quick
@@ -105,9 +105,9 @@ def test_a_long_round_is_not_written_out(monkeypatch):
     def loop(x):
         return jax.lax.scan(lambda c, _: (jnp.sin(c) + 1.0, None), x, None, 5)[0]
 
-    monkeypatch.setattr(traced_loops, "FEW_EQUATIONS", 2)
+    monkeypatch.setattr(fuse, "FEW_EQUATIONS", 2)
     assert [e.params["unroll"] for e in named(rewritten(loop, 1.0), "scan")] == [1]
-    monkeypatch.setattr(traced_loops, "FEW_EQUATIONS", 3)
+    monkeypatch.setattr(fuse, "FEW_EQUATIONS", 3)
     assert [e.params["unroll"] for e in named(rewritten(loop, 1.0), "scan")] == [4]
 
 

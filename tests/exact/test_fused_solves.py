@@ -7,7 +7,7 @@ import pytest
 from jax.extend.core import jaxpr_as_fun
 
 from purerl.exact import fused_solves, pallas_calls
-from tests.exact import GPU, rewritten
+from tests.exact import GPU, named, rewritten
 
 SIZES = (1, 2, 5, 14, 27, 32)
 
@@ -21,15 +21,35 @@ def close(found, exact):
     return np.abs(found - exact).max() < 2e-6 * np.abs(exact).max()
 
 
-def solve_upper(matrix, side):
-    return fused_solves.triangular_solve(matrix, side, lower=False, transposed=False)
+def by_kernel(function):
+    """Returns the function as on a GPU, where it is one kernel."""
+
+    def run(*inputs):
+        traced = rewritten(function, *inputs, platform=GPU)
+        assert len(named(traced, "pallas_call")) == 1
+        return jaxpr_as_fun(traced)(*inputs)[0]
+
+    return run
+
+
+@by_kernel
+def factor_of(matrix):
+    return jax.lax.linalg.cholesky(matrix, symmetrize_input=False)
+
+
+def solution(lower, transposed):
+    def solve(matrix, side):
+        options = {"left_side": True, "lower": lower, "transpose_a": transposed}
+        return jax.lax.linalg.triangular_solve(matrix, side[:, None], **options)[:, 0]
+
+    return by_kernel(solve)
 
 
 @pytest.mark.parametrize("n", SIZES)
 def test_the_factor_is_the_one_of_the_lower_half(n):
     matrix = positive_matrix(n)
     other_half = np.triu(np.full((n, n), 99.0, np.float32), 1)
-    factor = fused_solves.cholesky(jnp.asarray(matrix + other_half))
+    factor = factor_of(jnp.asarray(matrix + other_half))
     assert close(factor, np.linalg.cholesky(matrix.astype(np.float64)))
     assert (np.triu(factor, 1) == 0.0).all()
 
@@ -42,18 +62,16 @@ def test_a_solve_reads_the_half_it_is_told_to(n, lower, transposed):
     matrix = keep(positive_matrix(n) + 3.0 * np.eye(n, dtype=np.float32))
     side = np.random.default_rng(1).normal(size=n).astype(np.float32)
     other_half = junk(np.full((n, n), 99.0, np.float32), 1 if lower else -1)
-    found = fused_solves.triangular_solve(
-        jnp.asarray(matrix + other_half), jnp.asarray(side), lower=lower, transposed=transposed
-    )
+    found = solution(lower, transposed)(jnp.asarray(matrix + other_half), jnp.asarray(side))
     whole = matrix.T if transposed else matrix
     assert close(found, np.linalg.solve(whole.astype(np.float64), side))
 
 
-@pytest.mark.parametrize("function, number", [(fused_solves.cholesky, 1), (solve_upper, 2)])
+@pytest.mark.parametrize("function, number", [(factor_of, 1), (solution(False, False), 2)])
 def test_nothing_is_written_beyond_a_system(function, number):
     """Interpreted, a kernel drops such writes; on a GPU they are in the next system."""
     inputs = (jnp.zeros((5, 5)), jnp.zeros(5))[:number]
-    (call,) = jax.make_jaxpr(function)(*inputs).jaxpr.eqns
+    (call,) = named(jax.make_jaxpr(function)(*inputs), "pallas_call")
     (write,) = [e for e in call.params["jaxpr"].eqns if e.primitive.name == "masked_swap"]
     assert write.invars[-1].aval.dtype == bool, "no mask"
 
@@ -62,7 +80,7 @@ def test_nothing_is_written_beyond_a_system(function, number):
 def test_a_bad_pivot_gives_no_number(pivot):
     matrix = np.diag([4.0, 1.0, pivot, 1.0]).astype(np.float32)
     matrix[3, 2] = 1.0  # by a pivot of 0 it would be infinite
-    factor = np.asarray(fused_solves.cholesky(jnp.asarray(matrix)))
+    factor = np.asarray(factor_of(jnp.asarray(matrix)))
     assert factor[0, 0] == 2.0 and factor[1, 1] == 1.0
     assert np.isnan(factor[2:, 2]).all() and np.isnan(factor[3, 3])
 

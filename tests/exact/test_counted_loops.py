@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from purerl.exact.traced_loops import has_loop
-from purerl.exact.traces import equations
+from purerl.exact.traces import equations, has_loop
 from tests.exact import rewritten
 
 LIMIT = 5
