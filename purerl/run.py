@@ -53,7 +53,7 @@ def _help_page() -> str:
 def _command(arguments: Sequence[str]) -> None:
     """Parses, trains, and with --video shows the policy of the first seed."""
     from purerl import render
-    from purerl.report.renderer import choose_gl
+    from purerl.report.opengl import choose_gl
     from purerl.runs import training
     from purerl.runs.command_line import from_command_line
 

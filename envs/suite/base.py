@@ -133,7 +133,7 @@ def few_iterations(model: mujoco.MjModel) -> None:
     There the whole batch pays for each iteration that any environment needs, and the models ask
     for up to 200. C keeps what the model says.
     """
-    lookup.limit_solver(model, 4, 8)
+    _limit_solver(model, 4, 8)
 
 
 def make_env(
@@ -279,3 +279,13 @@ def segment_distance(a: Array, u: Array, b: Array, v: Array) -> Array:
     s = jnp.clip((t * uv + r @ u) / (uu + tiny), -1.0, 1.0)
     apart = r + t[:, None] * v - s[:, None] * u
     return jnp.sqrt(jnp.min(jnp.sum(apart**2, axis=1)))
+
+
+def _limit_solver(model: mujoco.MjModel, iterations: int, line_search: int) -> None:
+    """Bounds Newton's iterations.
+
+    MJX runs each iteration in lockstep for the whole batch, so the slowest environment sets the
+    time of all; MuJoCo's C code stops each simulation when it has converged.
+    """
+    model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    model.opt.iterations, model.opt.ls_iterations = iterations, line_search

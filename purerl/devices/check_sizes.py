@@ -22,13 +22,9 @@ def check_divides(
 
 
 def check_minibatches(config: Config, recurrent: bool, size: int, name: str = "num_envs") -> None:
-    """Checks that the minibatches divide a rollout.
+    """Checks that the minibatches divide a rollout of `size` environments, called `name`.
 
-    Args:
-      config: the settings.
-      recurrent: whether the network has a memory; its minibatches hold whole rollouts.
-      size: environments of the rollout.
-      name: what `size` is called in the message.
+    Those of a `recurrent` network hold whole rollouts.
     """
     if config.segment_length:
         length = ("segment_length", config.segment_length)

@@ -25,7 +25,7 @@ LEVELS = {"init": 0, "collect": 1}
 
 
 def as_it_is(state: Any) -> Any:
-    """Returns a state of one device, which is where it should be."""
+    """Returns a state that is where it should be."""
     return state
 
 
@@ -43,11 +43,8 @@ class Compiling(NamedTuple):
 def set_up_jax(cache: bool) -> str:
     """Sets the options of JAX on which bits depend, and the cache of compiled programs.
 
-    Args:
-      cache: whether there is one; JAX_ENABLE_COMPILATION_CACHE=false in the environment says no.
-
-    Returns:
-      The cache's folder, or "off".
+    Returns the cache's folder; "off" without `cache`, or if the environment has none
+    (JAX_ENABLE_COMPILATION_CACHE=false).
     """
     jax.config.update("jax_threefry_partitionable", True)
     jax.config.update("jax_default_prng_impl", "threefry2x32")

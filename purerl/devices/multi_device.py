@@ -243,11 +243,7 @@ def compile_update(
 def compile_collects(
     layout: Layout, config: Config, env: Env, network: Network, abstract: TrainState
 ) -> tuple[list[Callable], PyTree, list[str]]:
-    """Compiles `collect` for each device here.
-
-    Returns:
-      The programs; the shapes of what one collects; its sums without a fixed order.
-    """
+    """Compiles `collect` for each device here; returns also its result's shapes, its loose sums."""
     program = jax.jit(functools.partial(collect, config, env, network), donate_argnums=1)
     learned = abstract.replace(**dict.fromkeys(PLACES))
     places = jax.tree.map(

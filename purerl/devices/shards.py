@@ -40,12 +40,9 @@ class Shards(NamedTuple):
 
 
 def parts_of(shards: Shards, slices: int = 1) -> Parts:
-    """Returns how the algorithm computes its parts.
+    """Returns how the algorithm computes its parts: shards, each cut into `slices`.
 
-    Args:
-      shards: how the batch is cut into shards.
-      slices: parts of each shard, computed side by side (`slices.py`); all arrays of parts are
-        [v * slices, ...].
+    All arrays of parts are [v * slices, ...]; slices are computed side by side (`slices.py`).
     """
     inner = SIDE_BY_SIDE if slices > 1 else WHOLE
     if shards.number == 1:

@@ -18,26 +18,19 @@ LEAST_SAMPLES = 256  # of a slice, in a minibatch
 
 
 def count_slices(config: Config, size: int, recurrent: bool, platform: str) -> int:
-    """Returns into how many slices a shard is cut, 1 unless it is computed on a GPU.
+    """Returns into how many slices a shard of `size` environments is cut, 1 but on a GPU.
 
-    Args:
-      config: for the sizes.
-      size: environments of the shard.
-      recurrent: whether the network has a memory; its minibatches hold whole rollouts.
-      platform: JAX's name for where the program will run.
+    Minibatches of a `recurrent` network hold whole rollouts. `platform` is JAX's name for one.
     """
     if platform != "gpu":
         return 1
     columns = 1 if recurrent else config.rollout_length // (config.segment_length or 1)
     samples = size * config.rollout_length // config.num_minibatches
-    fit = [
-        n
-        for n in (16, 8, 4, 2)
-        if size % n == 0
-        and size // n * columns % config.num_minibatches == 0
-        and samples // n >= LEAST_SAMPLES
-    ]
-    return fit[0] if fit else 1
+    for n in (16, 8, 4, 2):
+        whole = size % n == 0 and size // n * columns % config.num_minibatches == 0
+        if whole and samples // n >= LEAST_SAMPLES:
+            return n
+    return 1
 
 
 def cut_in_slices(number: int, experience: Experience) -> Experience:

@@ -1,4 +1,4 @@
-"""Questions to a `mujoco.MjModel` by name, and the changes that engines want made to one.
+"""Questions to a `mujoco.MjModel` by name.
 
 Everything that a reward or an observation reads is looked up here once, when the environment is
 built: never by a literal index.
@@ -93,13 +93,3 @@ def scale_action(model: mujoco.MjModel, action: Array) -> Array:
         )
     low, high = jnp.asarray(model.actuator_ctrlrange, jnp.float32).T
     return low + 0.5 * (action + 1.0) * (high - low)
-
-
-def limit_solver(model: mujoco.MjModel, iterations: int, line_search: int) -> None:
-    """Bounds Newton's iterations.
-
-    MJX runs each iteration in lockstep for the whole batch, so the slowest environment sets the
-    time of all; MuJoCo's C code stops each simulation when it has converged.
-    """
-    model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    model.opt.iterations, model.opt.ls_iterations = iterations, line_search
