@@ -105,7 +105,7 @@ def _addresses(eqn: core.JaxprEqn, indices: np.ndarray) -> np.ndarray:
     fits = ((starts >= 0) & (starts <= room)).all(axis=-1)
     steps = np.array([np.prod(shape[i + 1 :], dtype=np.int64) for i in range(len(shape))], np.int64)
     first = np.where(fits, starts @ steps, -np.prod(shape, dtype=np.int64))
-    inside = np.tensordot(steps, np.indices(sizes), 1).reshape(window)
+    inside = np.tensordot(steps, np.indices(tuple(sizes)), 1).reshape(window)
     address = np.add.outer(first, inside)
     window_axes = range(len(batch), address.ndim)
     return np.moveaxis(address, window_axes, d.update_window_dims).reshape(-1)

@@ -24,13 +24,7 @@ from purerl.physics import host_calls
 from purerl.physics.lookup import hash_model
 
 _BLOWN_UP = [
-    int(w)
-    for w in (
-        mujoco.mjtWarning.mjWARN_BADQPOS,
-        mujoco.mjtWarning.mjWARN_BADQVEL,
-        mujoco.mjtWarning.mjWARN_BADQACC,
-        mujoco.mjtWarning.mjWARN_BADCTRL,
-    )
+    int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{x}")) for x in ("QPOS", "QVEL", "QACC", "CTRL")
 ]
 
 
@@ -38,7 +32,7 @@ class CEngine:
     """Steps a model with MuJoCo's C code; see `physics.Physics` for what `init`, `step` promise."""
 
     def __init__(self, model: mujoco.MjModel, record: Any, stage: int, substeps: int):
-        """Remembers the model; simulations are allocated when the batch size is known.
+        """Copies the model; simulations are allocated when the batch size is known.
 
         Args:
           model: the model.
@@ -70,31 +64,26 @@ class CEngine:
         """One packed row in, one packed row out: the cost of a callback is per argument."""
         leaves, structure = jax.tree.flatten(state)
         names = tuple(sorted(changes))
-        row = _pack([*leaves, ctrl, *(changes[n] for n in names)])
+        given = [*leaves, ctrl, *(changes[n] for n in names)]
+        row = jnp.concatenate([jnp.ravel(x).astype(jnp.float32) for x in given])
         sizes = [leaf.shape for leaf in leaves] + self.shapes
-        width = sum(math.prod(s) for s in sizes)
+        ends = np.cumsum([math.prod(size) for size in sizes])
         fields = tuple(state.__dataclass_fields__)
         host = functools.partial(_run_rows, self, fields, names, substeps)
         name = "-".join([self.name, str(substeps), *fields, *names])
-        out = _unpack(_call_host(name, host, width, row), sizes)
+        parts = jnp.split(_call_host(name, host, int(ends[-1]), row), ends[:-1])
+        out = [part.reshape(size) for part, size in zip(parts, sizes, strict=True)]
         state = jax.tree.unflatten(structure, out[: len(leaves)])
         return state, self.record(*map(_as_matrix, self.record._fields, out[len(leaves) :]))
 
     def batch(self, number: int, names: tuple[str, ...]) -> Batch:
         """Returns the simulations for `number` environments with the changed fields `names`."""
         if (number, names) not in self.batches:
-            model = _movable(self.model, names)
-            self.batches[number, names] = Batch(model, number, nthread=usable_cores())
+            # MuJoCo by itself starts a thread for each core of the machine, of which this process
+            # may use a few: 64 threads on two cores stepped ants at 0.74 of the rate of two.
+            cores = len(os.sched_getaffinity(0))
+            self.batches[number, names] = Batch(_movable(self.model, names), number, nthread=cores)
         return self.batches[number, names]
-
-
-def usable_cores() -> int:
-    """Returns how many cores this process may use, on a shared machine fewer than it has.
-
-    MuJoCo by itself starts a thread for each that there is: 64 of them on two cores stepped ants at
-    0.74 of the rate of two.
-    """
-    return len(os.sched_getaffinity(0))
 
 
 def _call_host(name: str, host: Callable, width: int, row: Array) -> Array:
@@ -129,18 +118,6 @@ def _as_matrix(name: str, value: Array) -> Array:
     return value.reshape(-1, 3, 3) if name.endswith("mat") else value
 
 
-def _pack(leaves: list[Array]) -> Array:
-    return jnp.concatenate([jnp.ravel(x).astype(jnp.float32) for x in leaves])
-
-
-def _unpack(row: Array, shapes: list[tuple[int, ...]]) -> list[Array]:
-    """Cuts one row [width] into arrays of `shapes`."""
-    ends = np.cumsum([math.prod(s) for s in shapes])
-    return [
-        jnp.reshape(row[end - math.prod(s) : end], s) for end, s in zip(ends, shapes, strict=True)
-    ]
-
-
 def _run_rows(
     engine: CEngine, fields: tuple[str, ...], names: tuple[str, ...], substeps: int, rows: Any
 ) -> np.ndarray:
@@ -167,7 +144,8 @@ def _run_rows(
         _load(targets, flat, bad, engine.model)
         batch.warning[...] = 0
         bad |= _advance(batch, engine.stage, substeps)
-        out = _save(sources, len(flat))
+        read = [source.reshape(len(flat), math.prod(source.shape[1:])) for source in sources]
+        out = np.concatenate(read, axis=1, dtype=np.float32)
     out[bad] = np.nan
     return out.reshape(*rows.shape[:-1], out.shape[-1])
 
@@ -182,11 +160,9 @@ def _load(targets: list[np.ndarray], rows: np.ndarray, bad: np.ndarray, model) -
         rows = rows.copy()
         rows[bad] = 0.0
         rows[bad, : model.nq] = model.qpos0
-    start = 0
-    for target in targets:
-        size = math.prod(target.shape[1:])
-        target[...] = rows[:, start : start + size].reshape(target.shape)
-        start += size
+    ends = np.cumsum([math.prod(target.shape[1:]) for target in targets])
+    for target, columns in zip(targets, np.split(rows, ends[:-1], axis=1), strict=True):
+        target[...] = columns.reshape(target.shape)
 
 
 def _advance(batch: Batch, stage: int, substeps: int) -> np.ndarray:
@@ -200,14 +176,3 @@ def _advance(batch: Batch, stage: int, substeps: int) -> np.ndarray:
         pass  # `status` says which; the others ran to completion
     # MuJoCo answers a blow-up with a warning and a silent reset of that simulation.
     return (batch.status != 0) | (batch.warning[:, _BLOWN_UP, 1] > 0).any(axis=1)
-
-
-def _save(sources: list[np.ndarray], number: int) -> np.ndarray:
-    """Reads the simulations back into packed rows [N, width]."""
-    sizes = [math.prod(s.shape[1:]) for s in sources]
-    out = np.empty((number, sum(sizes)), np.float32)
-    start = 0
-    for source, size in zip(sources, sizes, strict=True):
-        out[:, start : start + size] = source.reshape(number, size)
-        start += size
-    return out

@@ -15,23 +15,15 @@ from purerl.core.records import Array
 
 ENGINES = ("auto", "c", "jax", "warp")
 
-_POSITION: tuple[str, ...] = (
-    "xpos",
-    "xquat",
-    "xmat",
-    "xipos",
-    "ximat",
-    "xanchor",
-    "xaxis",
-    "geom_xpos",
-)
-_POSITION += ("geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat", "subtree_com")
-_POSITION += ("cinert", "crb", "cdof", "ten_length", "actuator_length")
-_VELOCITY: tuple[str, ...] = ("cvel", "cdof_dot", "ten_velocity", "actuator_velocity", "qfrc_bias")
-_VELOCITY += ("qfrc_passive", "subtree_linvel", "subtree_angmom")
-_ACCELERATION: tuple[str, ...] = ("qacc", "act_dot", "actuator_force", "qfrc_actuator")
-_ACCELERATION += ("qfrc_smooth",)
-_ACCELERATION += ("qacc_smooth", "qfrc_constraint", "cacc", "cfrc_int", "cfrc_ext")
+_POSITION = """
+xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat cam_xpos cam_xmat
+subtree_com cinert crb cdof ten_length actuator_length""".split()  # noqa: SIM905
+_VELOCITY = """
+cvel cdof_dot ten_velocity actuator_velocity qfrc_bias qfrc_passive subtree_linvel
+subtree_angmom""".split()  # noqa: SIM905
+_ACCELERATION = """
+qacc act_dot actuator_force qfrc_actuator qfrc_smooth qacc_smooth qfrc_constraint cacc cfrc_int
+cfrc_ext""".split()  # noqa: SIM905
 READINGS = (*_POSITION, *_VELOCITY, *_ACCELERATION, "sensordata")
 
 # Fields of MjModel that may differ between environments, on every engine: a test compares them with
@@ -56,13 +48,12 @@ CHANGEABLE_FIELDS = tuple(
     """.split()  # noqa: SIM905
 )
 
-_S = mujoco.mjtSensor
 # Fields that MuJoCo computes only for the sake of a sensor: without one they hold old values.
-_FOR_BODY_FORCES: tuple = (_S.mjSENS_ACCELEROMETER, _S.mjSENS_FORCE, _S.mjSENS_TORQUE)
-_FOR_BODY_FORCES += (_S.mjSENS_FRAMELINACC, _S.mjSENS_FRAMEANGACC)
-_FOR_SUBTREE: tuple = (_S.mjSENS_SUBTREELINVEL, _S.mjSENS_SUBTREEANGMOM)
-_NEEDS_SENSOR = dict.fromkeys(("cacc", "cfrc_int", "cfrc_ext"), _FOR_BODY_FORCES)
-_NEEDS_SENSOR |= dict.fromkeys(("subtree_linvel", "subtree_angmom"), _FOR_SUBTREE)
+_OF_BODY_FORCES = ["accelerometer", "force", "torque", "framelinacc", "frameangacc"]
+_NEEDS_SENSOR = dict.fromkeys(("cacc", "cfrc_int", "cfrc_ext"), _OF_BODY_FORCES)
+_NEEDS_SENSOR |= dict.fromkeys(
+    ("subtree_linvel", "subtree_angmom"), ["subtreelinvel", "subtreeangmom"]
+)
 
 
 class PhysicsState(struct.PyTreeNode):
@@ -87,24 +78,23 @@ class Physics:
     `init` and `step` describe ONE simulation and are pure under jit, vmap, nested vmap and scan.
 
     Readings are a NamedTuple with the fields asked for at construction, float32, of the same
-    shapes on every engine. As in dm_control, position- and velocity-dependent readings (and
-    sensors) are current, that is, of the state returned; acceleration-dependent ones
-    (`actuator_force`, `qfrc_actuator`, `cfrc_ext`, accelerometers, touch, ...) are those of the
-    last substep, which led to that state.
+    shapes on every engine. As in dm_control, those that depend on positions and velocities are of
+    the state returned. Those that depend on accelerations (`actuator_force`, `qfrc_actuator`,
+    `cfrc_ext`, accelerometers, touch, ...) are of the last substep, which led to that state.
 
     `changes` maps MjModel field names to this simulation's values, of the field's own shape
-    (`{"geom_friction": [ngeom, 3]}`). Fields are set as they are: constants that the model
+    (`{"geom_friction": [ngeom, 3]}`). Fields are set as they are. Constants that the model
     compiler derives from them (`body_invweight0`, `body_subtreemass`, ... of `mj_setConst`) do not
-    follow, on any engine; change those beside them where it matters (for the mass of a lone free
-    body `dof_M0` too, which the C code reads; the centre of mass of a lone free body cannot follow
-    `body_ipos`: put it into a body of its own).
+    follow: change those too where it matters (for the mass of a lone free body also `dof_M0`, which
+    the C code reads). The centre of mass of a lone free body cannot follow `body_ipos`: put it into
+    a body of its own.
 
     A simulation that blows up, or is given NaN, returns NaN and touches no other.
 
-    On `warp` contacts and constraints have buffers of a fixed size, which may be too small: then
-    some were left out of a step, and the reading "overflow" ([], that engine's alone) is 1 and not
-    0. Of a Physics that does not read it, such a simulation has blown up. `overflow_reading` and
-    `overflow_metric` make a metric of it in one line each.
+    On `warp` contacts and constraints have buffers of a fixed size. If they are too small for a
+    step, some are left out, and the reading "overflow" ([], that engine's alone) is 1 and not 0.
+    If it is not read, such a simulation has blown up. `overflow_reading` and `overflow_metric` make
+    a metric of it.
     """
 
     model: mujoco.MjModel
@@ -147,8 +137,7 @@ class Physics:
         model, changes = self.model, self._check_changes(changes)
         _check_shape("qpos", qpos, (model.nq,))
         _check_shape("qvel", qvel, (model.nv,))
-        mocap = np.array([np.flatnonzero(model.body_mocapid == i)[0] for i in range(model.nmocap)])
-        mocap = mocap.astype(int)
+        mocap = np.argsort(model.body_mocapid, kind="stable")[model.nbody - model.nmocap :]
         state = PhysicsState(
             qpos=_float32(qpos),
             qvel=_float32(qvel),
@@ -200,8 +189,7 @@ def choose_engine(engine: str) -> str:
     if engine == "warp" and importlib.util.find_spec("warp") is None:
         raise ValueError(
             "engine 'warp' (MJX-Warp) cannot run here: it needs the warp-lang package (pip install "
-            "-c constraints.txt -e '.[warp]') and an NVIDIA GPU. Or use 'jax' on a GPU, 'c' on a "
-            "CPU."
+            "-c constraints.txt -e '.[warp]') and an NVIDIA GPU. Use 'jax' on a GPU, 'c' on a CPU."
         )
     if engine == "auto":
         return "c" if jax.default_backend() == "cpu" else "jax"
@@ -236,14 +224,12 @@ def _build_engine(engine: str, model: mujoco.MjModel, record: Any, substeps: int
 
 def _stage(model: mujoco.MjModel, readings: tuple[str, ...]) -> int:
     """The least `mujoco.mjtStage` that makes the readings current at the new state."""
-    stage = int(mujoco.mjtStage.mjSTAGE_NONE)
-    if any(name in _POSITION for name in readings):
-        stage = int(mujoco.mjtStage.mjSTAGE_POS)
-    if any(name in _VELOCITY for name in readings):
-        stage = int(mujoco.mjtStage.mjSTAGE_VEL)
-    early = model.sensor_needstage[model.sensor_needstage <= int(mujoco.mjtStage.mjSTAGE_VEL)]
-    sensors = int(early.max()) if "sensordata" in readings and early.size else 0
-    return max(stage, sensors)
+    position, velocity = int(mujoco.mjtStage.mjSTAGE_POS), int(mujoco.mjtStage.mjSTAGE_VEL)
+    stages = [position for name in readings if name in _POSITION]
+    stages += [velocity for name in readings if name in _VELOCITY]
+    if "sensordata" in readings:
+        stages += [int(stage) for stage in model.sensor_needstage if stage <= velocity]
+    return max(stages, default=int(mujoco.mjtStage.mjSTAGE_NONE))
 
 
 def _check_model(model: mujoco.MjModel, readings: tuple[str, ...]) -> None:
@@ -262,12 +248,12 @@ def _check_model(model: mujoco.MjModel, readings: tuple[str, ...]) -> None:
     for name in readings:
         if name not in READINGS:
             raise ValueError(unknown_name("reading", name, READINGS))
-        needed = _NEEDS_SENSOR.get(name)
-        if needed and not np.isin(model.sensor_type, [int(s) for s in needed]).any():
-            kinds = ", ".join(s.name.removeprefix("mjSENS_").lower() for s in needed)
+        kinds = _NEEDS_SENSOR.get(name, [])
+        needed = [int(getattr(mujoco.mjtSensor, f"mjSENS_{kind.upper()}")) for kind in kinds]
+        if needed and not np.isin(model.sensor_type, needed).any():
             raise ValueError(
                 f"MuJoCo computes {name!r} only for a model with a sensor that needs it: add one "
-                f"of {kinds}."
+                f"of {', '.join(kinds)}."
             )
     off = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR
     if off and any(n == "sensordata" or n in _NEEDS_SENSOR for n in readings):

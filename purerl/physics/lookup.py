@@ -20,8 +20,6 @@ _TYPES = {
 }
 _COUNTS = {"body": "nbody", "joint": "njnt", "geom": "ngeom", "site": "nsite", "sensor": "nsensor"}
 _COUNTS |= {"actuator": "nu", "tendon": "ntendon", "camera": "ncam"}
-_QPOS_WIDTH = {0: 7, 1: 4, 2: 1, 3: 1}  # by mjtJoint: free, ball, slide, hinge
-_QVEL_WIDTH = {0: 6, 1: 3, 2: 1, 3: 1}
 
 
 def hash_model(model: mujoco.MjModel, rest: tuple = ()) -> str:
@@ -58,18 +56,18 @@ def find(model: mujoco.MjModel, kind: str, name: str) -> int:
 
 def qpos_indices(model: mujoco.MjModel, joints: Iterable[str]) -> np.ndarray:
     """Returns where the positions of the joints stand in qpos, in the order given, [n] int."""
-    return _indices(model, joints, model.jnt_qposadr, _QPOS_WIDTH)
+    return _indices(model, joints, model.jnt_qposadr, model.nq)
 
 
 def qvel_indices(model: mujoco.MjModel, joints: Iterable[str]) -> np.ndarray:
     """Returns where the velocities of the joints stand in qvel, in the order given, [n] int."""
-    return _indices(model, joints, model.jnt_dofadr, _QVEL_WIDTH)
+    return _indices(model, joints, model.jnt_dofadr, model.nv)
 
 
-def _indices(model, joints: Iterable[str], starts: np.ndarray, widths: dict) -> np.ndarray:
+def _indices(model, joints: Iterable[str], starts: np.ndarray, number: int) -> np.ndarray:
     ids = [find(model, "joint", name) for name in joints]
-    ranges = [np.arange(starts[i], starts[i] + widths[int(model.jnt_type[i])]) for i in ids]
-    return np.concatenate([*ranges, np.zeros(0, int)]).astype(int)
+    ends = [*starts[1:], number]
+    return np.concatenate([*(np.arange(starts[i], ends[i]) for i in ids), np.zeros(0, int)])
 
 
 def sensor_slice(model: mujoco.MjModel, name: str) -> slice:
