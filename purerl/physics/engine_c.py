@@ -121,17 +121,10 @@ def _as_matrix(name: str, value: Array) -> Array:
 def _run_rows(
     engine: CEngine, fields: tuple[str, ...], names: tuple[str, ...], substeps: int, rows: Any
 ) -> np.ndarray:
-    """Runs the simulations of packed rows (host, numpy only).
+    """Steps packed rows, [..., state + ctrl + changes] -> [..., state + readings] (host, numpy).
 
-    Args:
-      engine: the engine, for its model and its simulations.
-      fields: the parts of the state, in the order in which a row holds them.
-      names: the changed model fields, in the same way.
-      substeps: physics steps; 0 computes the readings at the state as it is.
-      rows: [..., state + ctrl + changes] float32.
-
-    Returns:
-      [..., state + readings] float32; a simulation that blew up is all NaN.
+    `fields` of the state and changed `names` of the model are in the order of a row. 0 substeps
+    compute the readings at the state as it is. A simulation that blew up is all NaN.
     """
     rows = np.asarray(rows)
     flat = rows.reshape(-1, rows.shape[-1])

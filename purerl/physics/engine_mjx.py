@@ -31,17 +31,10 @@ class JaxEngine:
         substeps: int,
         platform: str | None = None,
     ):
-        """Puts the model on the device.
+        """Puts the model on the device; ValueError if MJX cannot simulate all of it.
 
-        Args:
-          model: the model.
-          record: the NamedTuple of readings.
-          late: the readings that are those of the last substep.
-          substeps: physics steps in one control step.
-          platform: what `exact.rewrite` is told; None: the platform of this process's first device.
-
-        Raises:
-          ValueError: MJX refuses the model, or would leave out a part of it without a word.
+        `record` is the NamedTuple of readings; those that are `late` are of the last substep.
+        `exact.rewrite` is told the `platform`, by default that of this process's first device.
         """
         check_known(model)
         self.record, self.late, self.substeps = record, late, substeps

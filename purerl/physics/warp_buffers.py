@@ -168,17 +168,11 @@ def make_call(
     size: int,
     get_batch: Callable[[Any], Batch],
 ) -> Callable[[dict[str, Array]], list[dict[str, Array]]]:
-    """Returns a function for JAX that runs stages on a batch.
+    """Returns a function for JAX that runs stages on a batch of `size` simulations.
 
-    It takes a dict of fields [size, ...] and returns what each stage gives.
-
-    Args:
-      name: of the call; a batch records the graphs of a name once.
-      stages: what is run, and what is read in between.
-      takes: the fields it is given: of the data, or of the model if they are a batch's `changed`.
-      size: simulations.
-      get_batch: returns the batch on one of Warp's devices, the current one. Warp keeps it, and
-        what it holds, as long as the process lasts.
+    It takes a dict of fields [size, ...] (of the data, or of the model if they are `changed`) and
+    returns what each stage gives. A batch records the graphs of a `name` once. `get_batch` returns
+    the batch on Warp's current device; Warp keeps it as long as the process lasts.
     """
     inputs = list(filled(takes))
     lengths = {

@@ -149,12 +149,7 @@ def unroll(network: Network, params: PyTree, batch: Batch, memory: PyTree) -> Po
 
 
 def loss(
-    config: Config,
-    network: Network,
-    params: PyTree,
-    scale: Moments,
-    batch: Batch,
-    memory: PyTree,
+    config: Config, network: Network, params: PyTree, scale: Moments, batch: Batch, memory: PyTree
 ) -> tuple[Array, Metrics]:
     """Returns policy loss + value_weight * value loss - entropy_weight * entropy, [], and metrics.
 

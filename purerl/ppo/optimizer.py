@@ -10,8 +10,7 @@ from purerl.ppo.config import Config
 def optimizer(config: Config) -> optax.GradientTransformation:
     """Clips by global norm, then Adam's direction; the caller multiplies by the learning rate."""
     return optax.chain(
-        optax.clip_by_global_norm(config.max_gradient_norm),
-        optax.scale_by_adam(eps=1e-5),
+        optax.clip_by_global_norm(config.max_gradient_norm), optax.scale_by_adam(eps=1e-5)
     )
 
 

@@ -167,10 +167,7 @@ def rollout(
     end, transitions = jax.lax.scan(step, start, jnp.arange(config.rollout_length))
     output, _ = act(network, state, end.env, end.memory)
     state = state.replace(
-        env=end.env,
-        carry=end.memory,
-        episode=end.episode,
-        discounted_return=end.discounted_return,
+        env=end.env, carry=end.memory, episode=end.episode, discounted_return=end.discounted_return
     )
     return state, transitions, end.sums, output.value
 

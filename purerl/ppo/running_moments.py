@@ -130,8 +130,7 @@ def merge(statistics: Statistics, batch: Moments) -> Statistics:
     mean = jax.tree.map(lambda delta, mean: _add(mean, share * delta), batch.mean, statistics.mean)
     variance = jax.tree.map(
         lambda delta, spread, variance: _add(
-            variance,
-            share * (spread - variance.value) + share * (1.0 - share) * jnp.square(delta),
+            variance, share * (spread - variance.value) + share * (1.0 - share) * jnp.square(delta)
         ),
         batch.mean,
         batch.variance,

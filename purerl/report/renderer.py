@@ -17,17 +17,10 @@ class Renderer(contextlib.AbstractContextManager):
     """Draws pictures of one model; to be used in a `with`."""
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int, camera: str = "") -> None:
-        """Prepares a model to be drawn.
+        """Prepares a copy of a model to be drawn, in frames of width x height [pixels].
 
-        Args:
-          model: it is copied, since pictures change its fields.
-          width: of a frame [pixels].
-          height: of a frame [pixels].
-          camera: a camera's name in the model; "": see `default_camera`.
-
-        Raises:
-          RunError: there is no OpenGL.
-          ValueError: there is no such camera; the message lists those there are.
+        Without a `camera`'s name: `default_camera`. RunError if there is no OpenGL; ValueError if
+        there is no such camera.
         """
         self.model = model = copy.copy(model)
         # The compiler marks geoms that coincide with their body, and MuJoCo then never reads their
