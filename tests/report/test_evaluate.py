@@ -130,7 +130,7 @@ def test_a_setting_and_code_that_came_after_the_run_are_told(tmp_path, capsys):
     older = json.loads(settings.read_text())
     del older["settings"]["ppo"]["desired_kl"]
     settings.write_text(json.dumps(older))
-    facts.write_text(json.dumps(json.loads(facts.read_text()) | {"source": "older"}))
+    facts.write_text(json.dumps(json.loads(facts.read_text()) | {"source": {}}))
     assert result(trained, tmp_path)["update"] == 12
     said = capsys.readouterr().out
     assert "config.json lacks ppo.desired_kl; it is taken as 0.01." in said
