@@ -92,12 +92,17 @@ def _is_within(package: str, folders: set[Path]) -> bool:
 
 def _installed_folders() -> set[Path]:
     """Returns where Python and installed packages are: beside a package there is its metadata."""
-    found = {Path(sysconfig.get_path("stdlib"))}
-    for folder in {Path(place).absolute() for place in sys.path}:
-        # What cannot be read cannot be this process's own source.
-        if not os.access(folder, os.R_OK) or any(folder.glob("*.dist-info")):
-            found.add(folder)
-    return found
+    places = {Path(place).absolute() for place in sys.path}
+    return {*filter(_holds_packages, places), Path(sysconfig.get_path("stdlib"))}
+
+
+def _holds_packages(folder: Path) -> bool:
+    try:
+        return any(name.endswith(".dist-info") for name in os.listdir(folder))
+    except PermissionError:  # whatever is in it, it cannot be this process's own source
+        return True
+    except OSError:  # an archive, or nothing
+        return False
 
 
 def module_file(name: str) -> Path | None:

@@ -53,13 +53,11 @@ def unflatten(leaves: Leaves, abstract: PyTree) -> PyTree:
     return jax.tree.unflatten(jax.tree.structure(abstract), out)
 
 
-def digest(state: PyTree) -> str:
-    """Returns the sha256 of a state: two runs with equal digests are the same run."""
-    return digest_leaves(flatten(state))
-
-
 def digest_leaves(leaves: Leaves) -> str:
-    """Returns a sha256 over path, dtype, shape and bytes of every leaf, in path order."""
+    """Returns a sha256 over path, dtype, shape and bytes of every leaf, in path order.
+
+    Two runs whose states have equal digests are the same run.
+    """
     total = hashlib.sha256()
     for path, array in sorted(leaves.items()):
         total.update(f"{path}\0{array.dtype}\0{array.shape}\0".encode())
