@@ -5,8 +5,7 @@ import math
 from collections.abc import Callable
 
 from dm_control import mjcf
-from dm_control.locomotion.walkers import ant as dm_ant
-from dm_control.locomotion.walkers import rodent as dm_rodent
+from dm_control.locomotion.walkers import ant as dm_ant, rodent as dm_rodent
 
 
 @dataclasses.dataclass(frozen=True)

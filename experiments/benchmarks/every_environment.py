@@ -13,8 +13,7 @@ from functools import partial
 
 import jax
 
-from envs.suite.tasks import TASKS
-from envs.suite.tasks import Options as SuiteOptions
+from envs.suite.tasks import TASKS, Options as SuiteOptions
 from experiments.benchmarks.benchmark import bare_physics, compile_part, measure
 from purerl.core.errors import UserError, one_line
 from purerl.ppo import algorithm

@@ -200,8 +200,7 @@ def train_brax(
       seed: brax's.
     """
     from brax import envs
-    from brax.training.agents.ppo import networks as brax_networks
-    from brax.training.agents.ppo import train
+    from brax.training.agents.ppo import networks as brax_networks, train
 
     lend_removed_function()
     names = "num_envs unroll_length batch_size num_minibatches num_updates_per_batch discounting"

@@ -7,8 +7,7 @@ from typing import Any
 import jax
 from jax.extend import core
 
-from purerl.exact import fuse as optimisation
-from purerl.exact import order
+from purerl.exact import fuse as optimisation, order
 from purerl.exact.walk import rewrite_trace
 
 

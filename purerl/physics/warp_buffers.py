@@ -44,17 +44,11 @@ class Batch:
     def __init__(
         self, model: mujoco.MjModel, size: int, contacts: int, rows: int, changed: tuple[str, ...]
     ):
-        """Takes the memory, on Warp's current device.
+        """Takes the memory, on Warp's current device; RuntimeError if there is not so much.
 
-        Args:
-          model: the model.
-          size: simulations.
-          contacts: as many as the model allows one simulation. All share what room there is.
-          rows: room for rows of constraints, of each simulation.
-          changed: fields of the model of which each simulation has its own value.
-
-        Raises:
-          RuntimeError: there is not so much memory.
+        `contacts`: as many as the model allows one simulation, of `size`; all share what room there
+        is. `rows`: room for rows of constraints, of each. Of `changed` fields of the model each has
+        its own value.
         """
         try:
             self.model = put_model(model, dict.fromkeys(changed, size))

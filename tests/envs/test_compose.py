@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from mujoco.batch import Batch
 
-from envs import arenas
-from envs import compose as compose_module
+from envs import arenas, compose as compose_module
 from envs.arenas import Floor, GapsCorridor, course_changes, draw_course
 from envs.bodies import ANT, RODENT
 from envs.compose import PREFIX, compose

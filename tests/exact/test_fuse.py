@@ -12,8 +12,7 @@ from jax.extend.core import jaxpr_as_fun
 from purerl.exact import fuse
 from purerl.exact.fuse import WRITTEN_OUT
 from purerl.physics.interface import Physics
-from tests import exact as shared
-from tests import quick
+from tests import exact as shared, quick
 from tests.exact import GPU, for_gpu, named
 
 rewritten = functools.partial(shared.rewritten, platform=GPU)

@@ -17,8 +17,7 @@ from envs import cartpole_swingup
 from purerl import render, run
 from purerl.core.errors import FAILURE, USAGE, RunError
 from purerl.core.keys import per_environment
-from purerl.report import episode_pictures, opengl
-from purerl.report import renderer as drawing
+from purerl.report import episode_pictures, opengl, renderer as drawing
 from purerl.runs.policy import Policy
 from purerl.runs.run_folder import restore
 from tests import quick

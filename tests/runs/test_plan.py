@@ -1,8 +1,7 @@
 """A run's plan: whole updates within the budget, and events spread evenly over them."""
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from purerl.ppo.config import Config, Evaluation
 from purerl.runs.loop import evenly, make_plan

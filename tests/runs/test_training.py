@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import purerl
 from purerl import compare, evaluate, record, render, run
@@ -22,8 +21,7 @@ from purerl.core.errors import USAGE
 from purerl.exact import xla_flags
 from purerl.runs import training
 from purerl.runs.command_line import from_settings
-from purerl.runs.experiment import Experiment, Source, from_json, to_json
-from purerl.runs.experiment import settings as settings_of
+from purerl.runs.experiment import Experiment, Source, from_json, settings as settings_of, to_json
 from purerl.runs.options import Options
 from tests.runs import toy_experiment
 
