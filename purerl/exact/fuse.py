@@ -49,7 +49,7 @@ def rules(platform: str) -> list[Rule]:
     if platform not in pallas_calls.GPUS:
         return [counted]
     kernels = (fused_solves, fused_loops) if pallas_calls.can_run(platform) else ()
-    gathers, scans = Rule(puts, _gather_of_put), Rule(_is_short_or_reads_tall, _faster_scan)
+    gathers, scans = Rule(puts, gathered_scatter), Rule(_is_short_or_reads_tall, _faster_scan)
     return [*(_kernel(module, platform) for module in kernels), gathers, scans, counted]
 
 
@@ -63,10 +63,6 @@ def _kernel(module: ModuleType, platform: str) -> Rule:
         return with_own_derivative(eqn, functools.partial(module.compute, eqn, platform), inputs)
 
     return Rule(module.wanted, replace)
-
-
-def _gather_of_put(eqn: core.JaxprEqn, inputs: Sequence, inside: Inside) -> list | None:
-    return [gathered_scatter(eqn, inputs)] if is_known(inputs[1]) else None
 
 
 # --- scans ---

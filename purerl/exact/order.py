@@ -58,7 +58,7 @@ def _is_unordered(eqn: core.JaxprEqn) -> bool:
     return sums and jnp.issubdtype(eqn.invars[0].aval.dtype, jnp.inexact)
 
 
-RULE = Rule(_is_unordered, lambda eqn, inputs, inside: [ordered_scatter(eqn, inputs)])
+RULE = Rule(_is_unordered, ordered_scatter)
 
 
 def check_ordered(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:

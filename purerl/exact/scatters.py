@@ -9,16 +9,18 @@ from jax.extend import core
 
 from purerl.exact.constants import is_known
 from purerl.exact.traces import source
+from purerl.exact.walk import Inside
 
 _FEW_TERMS = 4
 
 
-def ordered_scatter(eqn: core.JaxprEqn, inputs: Sequence) -> Array:
+def ordered_scatter(eqn: core.JaxprEqn, inputs: Sequence, inside: Inside) -> list[Array]:
     """Computes a scatter-add by gathers, which are added in the order of the updates.
 
     Args:
       eqn: the equation.
       inputs: operand, indices and updates.
+      inside: not used.
 
     Raises:
       RuntimeError: the primitive is not a scatter-add, or its indices are not known.
@@ -44,7 +46,7 @@ def ordered_scatter(eqn: core.JaxprEqn, inputs: Sequence) -> Array:
         total = total + jnp.sum(_take(flat, turns), axis=0)
     place = np.arange(operand.size)
     place[touched] = operand.size + np.arange(len(touched))
-    return jnp.reshape(_take(jnp.concatenate([whole, total]), place), operand.shape)
+    return [jnp.reshape(_take(jnp.concatenate([whole, total]), place), operand.shape)]
 
 
 def puts(eqn: core.JaxprEqn) -> bool:
@@ -55,21 +57,23 @@ def puts(eqn: core.JaxprEqn) -> bool:
     return eqn.primitive.name == "scatter" and eqn.params["update_jaxpr"] is None
 
 
-def gathered_scatter(eqn: core.JaxprEqn, inputs: Sequence) -> Array:
-    """Computes a scatter that `puts`, with known indices, by one gather.
+def gathered_scatter(eqn: core.JaxprEqn, inputs: Sequence, inside: Inside) -> list | None:
+    """Computes a scatter that `puts` by one gather; None if its indices are not known.
 
     XLA has two kernels for a scatter, one of them a copy, and neither is fused with others. It
     leaves open which of several updates at one place is kept; here it is the last.
     """
     operand, indices, updates = inputs
+    if not is_known(indices):
+        return None
     addresses = _addresses(eqn, indices)
     kept = np.flatnonzero(addresses >= 0)
     if not kept.size:
-        return operand
+        return [operand]
     place = np.full(operand.size, -1)
     place[addresses[kept]] = kept
     put = jnp.reshape(_take(jnp.reshape(updates, (-1,)), np.maximum(place, 0)), operand.shape)
-    return jnp.where(np.reshape(place >= 0, operand.shape), put, operand)
+    return [jnp.where(np.reshape(place >= 0, operand.shape), put, operand)]
 
 
 def _take(flat: Array, index: np.ndarray) -> Array:

@@ -36,14 +36,20 @@ class JaxEngine:
         `record` is the NamedTuple of readings; those that are `late` are of the last substep.
         `exact.rewrite` is told the `platform`, by default that of this process's first device.
         """
-        check_known(model)
+        _check_known(model)
         self.record, self.late, self.substeps = record, late, substeps
         self.shapes = reading_shapes(model, record._fields)
+        device = jax.local_devices()[0]  # MJX by itself takes the first of all processes
         with mjx_defaults():
-            self.model = put_model(model)
-            self.data = mjx.make_data(model, device=_own_device(), impl="jax")
+            try:
+                self.model = mjx.put_model(model, device=device, impl="jax")
+            except NotImplementedError as error:
+                raise ValueError(
+                    f"MJX cannot simulate this model: {error} Change the model, or use engine 'c'."
+                ) from error
+            self.data = mjx.make_data(model, device=device, impl="jax")
         # MJX takes seconds to trace: reset, training and evaluation share one trace of each.
-        platform = platform or _own_device().platform
+        platform = platform or device.platform
         self._exact_init = exact.rewrite(self.plain_init, platform=platform)
         self._exact_step = exact.rewrite(self.plain_step, platform=platform)
 
@@ -60,7 +66,7 @@ class JaxEngine:
     def plain_init(self, state: PyTree, changes: dict[str, Array]) -> tuple:
         """Does what `init` does, with sums in any order."""
         model = self.model.tree_replace(changes) if changes else self.model
-        data = _forward(model, load_state(self.data, state), bool(self.late))
+        data = _forward(model, _load_state(self.data, state), bool(self.late))
         return self._read(data)
 
     def plain_step(
@@ -70,55 +76,39 @@ class JaxEngine:
         model = self.model.tree_replace(changes) if changes else self.model
 
         def substep(carry, _):
-            data = load_state(self.data, carry[0]).replace(ctrl=ctrl)
+            data = _load_state(self.data, carry[0]).replace(ctrl=ctrl)
             after = mjx.step(model, data)
             late = _forward(model, data, True) if self.late and _forgets_sensors(data) else after
-            return (save_state(carry[0], after), [field_of(late, n) for n in self.late]), None
+            state = carry[0].replace(**{n: getattr(after, n) for n in vars(carry[0])})
+            return (state, [_field_of(late, n) for n in self.late]), None
 
-        start = [jnp.zeros(field_of(self.data, n).shape) for n in self.late]
+        start = [jnp.zeros(_field_of(self.data, n).shape) for n in self.late]
         (state, late), _ = jax.lax.scan(substep, (state, start), None, self.substeps)
-        data = load_state(self.data, state).tree_replace(
-            {_place(n): v for n, v in zip(self.late, late, strict=True)}
-        )
+        places = [f"_impl.{name}" if name in _IN_IMPL else name for name in self.late]
+        data = _load_state(self.data, state).tree_replace(dict(zip(places, late, strict=True)))
         return state, self._read(_kinematics(model, data))
 
     def _read(self, data: mjx.Data) -> tuple:
-        read = [jnp.reshape(field_of(data, n), shape) for n, shape in self.shapes.items()]
+        read = [jnp.reshape(_field_of(data, n), shape) for n, shape in self.shapes.items()]
         return self.record(*(x.astype(jnp.float32) for x in read))
 
 
-def check_known(model: mujoco.MjModel) -> None:
+def _check_known(model: mujoco.MjModel) -> None:
     """Raises ValueError for what MJX leaves out silently: the motion would be another than C's."""
-    polynomials = ("jnt_stiffnesspoly", "dof_dampingpoly", "tendon_stiffnesspoly")
-    polynomials += ("tendon_dampingpoly",)
     bits = (mujoco.mjtDisableBit.mjDSBL_SPRING, mujoco.mjtDisableBit.mjDSBL_DAMPER)
     passive = [bool(model.opt.disableflags & int(bit)) for bit in bits]
     left_out = {
         f"noslip_iterations = {model.opt.noslip_iterations}": model.opt.noslip_iterations,
         "only one of springs and dampers disabled": passive[0] != passive[1],
     }
-    left_out |= {f"a non-zero {name}": getattr(model, name).any() for name in polynomials}
+    for what in ("jnt_stiffness", "dof_damping", "tendon_stiffness", "tendon_damping"):
+        left_out[f"a non-zero {what}poly"] = getattr(model, f"{what}poly").any()
     for what, there in left_out.items():
         if there:
             raise ValueError(
                 f"The model has {what}, which MJX does not have and leaves out without a word: "
                 "remove it, on every engine, or use engine 'c'."
             )
-
-
-def put_model(model: mujoco.MjModel) -> mjx.Model:
-    """Puts a model on the device; ValueError if MJX cannot simulate it."""
-    try:
-        return mjx.put_model(model, device=_own_device(), impl="jax")
-    except NotImplementedError as error:
-        raise ValueError(
-            f"MJX cannot simulate this model: {error} Change the model, or use engine 'c'."
-        ) from error
-
-
-def _own_device() -> jax.Device:
-    """Returns this process's first device; MJX by itself takes the first of all processes."""
-    return jax.local_devices()[0]
 
 
 def reading_shapes(model: mujoco.MjModel, names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
@@ -141,24 +131,14 @@ def mjx_defaults() -> contextlib.ExitStack:
     return stack
 
 
-def _place(name: str) -> str:
-    """Where `mjx.Data` keeps a field."""
-    return f"_impl.{name}" if name in _IN_IMPL else name
-
-
-def field_of(data: mjx.Data, name: str) -> Array:
+def _field_of(data: mjx.Data, name: str) -> Array:
     """Returns a field of `mjx.Data`, wherever it is kept."""
     return getattr(data._impl if name in _IN_IMPL else data, name)
 
 
-def load_state(data: mjx.Data, state: PyTree) -> mjx.Data:
+def _load_state(data: mjx.Data, state: PyTree) -> mjx.Data:
     """Puts an integration state into a blank `mjx.Data`."""
-    return data.replace(**{name: getattr(state, name) for name in state.__dataclass_fields__})
-
-
-def save_state(state: PyTree, data: mjx.Data) -> PyTree:
-    """Takes the integration state out of an `mjx.Data`."""
-    return state.replace(**{name: getattr(data, name) for name in state.__dataclass_fields__})
+    return data.replace(**vars(state))
 
 
 def _kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -166,15 +146,11 @@ def _kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
     What no reading uses is dropped by the compiler.
     """
-    data = smooth.kinematics(model, data)
-    data = smooth.com_pos(model, data)
-    data = smooth.camlight(model, data)
-    data = smooth.tendon(model, data)
-    data = smooth.crb(model, data)
-    data = smooth.transmission(model, data)
-    data = sensor.sensor_pos(model, data)
-    data = forward.fwd_velocity(model, data)
-    return sensor.sensor_vel(model, data)
+    parts = (smooth.kinematics, smooth.com_pos, smooth.camlight, smooth.tendon, smooth.crb)
+    parts += (smooth.transmission, sensor.sensor_pos, forward.fwd_velocity, sensor.sensor_vel)
+    for part in parts:
+        data = part(model, data)
+    return data
 
 
 def _forgets_sensors(data: mjx.Data) -> bool:

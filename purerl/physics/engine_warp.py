@@ -10,6 +10,7 @@ cannot know, decides how much room contacts get.
 
 import copy
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -34,10 +35,9 @@ from purerl.physics.warp_buffers import Batch, Shapes, Stage, make_call, put_mod
 # Running out of iterations is the solver's setting; everything else drops something.
 _DROPPED = ~int(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS)
 
-_S = mujoco.mjtSensor
-_OF_CONSTRAINTS = (_S.mjSENS_JOINTLIMITPOS, _S.mjSENS_JOINTLIMITVEL, _S.mjSENS_TENDONLIMITPOS)
-_OF_CONSTRAINTS += (_S.mjSENS_TENDONLIMITVEL, _S.mjSENS_GEOMDIST, _S.mjSENS_GEOMNORMAL)
-_OF_CONSTRAINTS += (_S.mjSENS_GEOMFROMTO, _S.mjSENS_CONTACT)
+# The few sensors that sense constraints without forces.
+_OF_CONSTRAINTS = ("JOINTLIMITPOS", "JOINTLIMITVEL", "TENDONLIMITPOS", "TENDONLIMITVEL")
+_OF_CONSTRAINTS += ("GEOMDIST", "GEOMNORMAL", "GEOMFROMTO", "CONTACT")
 # Readings for which the places of bodies and their mass are enough.
 _OF_BODIES = ("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos")
 _OF_BODIES += ("geom_xmat", "site_xpos", "site_xmat", "subtree_com", "cinert", "cdof")
@@ -64,14 +64,16 @@ class WarpEngine:
         if "subtree_com" in names:  # `_combine` needs both
             names += ("xipos",)
         self.shapes = reading_shapes(model, names)
-        self.late_sensors = _late_sensors(model)
+        of_acceleration = model.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC
+        self.late_sensors = np.repeat(of_acceleration, model.sensor_dim)  # [nsensordata] bool
         self.massless = model.body_subtreemass < mujoco.mjMINVAL
         self.early = tuple(n for n in self.shapes if n not in late or n == "sensordata")
         self.model = copy.copy(model)
         # It has no midphase, and refuses a model that switches it off.
         self.model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
         self.contacts, self.rows = room(model, _on_host(self.model))
-        sensed = "sensordata" in names and _sense_constraints(model)
+        sensors = [int(getattr(mujoco.mjtSensor, f"mjSENS_{name}")) for name in _OF_CONSTRAINTS]
+        sensed = "sensordata" in names and bool(np.isin(model.sensor_type, sensors).any())
         self.make_current = _how_to_read(self.early, sensed)
         self.batches: dict[Any, Batch] = {}
         self.calls: dict[Any, Callable] = {}
@@ -100,7 +102,9 @@ class WarpEngine:
         if "overflow" not in self.record._fields:
             lost |= dropped  # nobody looks
         state = state.replace(**{name: late[name] for name in _INTEGRATED})
-        state, found = jax.vmap(_lose)(lost, (state, self._combine(late, early)))
+        blow_up = jax.vmap(lambda yes, x: jnp.where(yes, jnp.nan, x))
+        both = state, self._combine(late, early)
+        state, found = jax.tree.map(functools.partial(blow_up, lost), both)
         return state, self._read(found, dropped.astype(jnp.float32))
 
     def _call(
@@ -172,18 +176,6 @@ def _on_host(model: mujoco.MjModel) -> mjw.Model:
         ) from error
 
 
-def _unconstrained(model: mjw.Model) -> mjw.Model:
-    """Returns the model without constraints: positions and velocities do not depend on them."""
-    model, model.opt = copy.copy(model), copy.copy(model.opt)
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-    return model
-
-
-def _sense_constraints(model: mujoco.MjModel) -> bool:
-    """Tells if the model has one of the few sensors that sense constraints without forces."""
-    return bool(np.isin(model.sensor_type, [int(s) for s in _OF_CONSTRAINTS]).any())
-
-
 def _how_to_read(early: tuple[str, ...], constraints_matter: bool) -> Callable:
     """Returns what makes the early readings current, at the least cost."""
     if not early:
@@ -200,23 +192,21 @@ def _bodies(model: mjw.Model, data: mjw.Data) -> None:
 
 
 def _forward(model: mjw.Model, data: mjw.Data) -> None:
-    """Makes all that follows from positions and velocities current."""
-    mjw.forward(_unconstrained(model), data)
+    """Makes what follows from positions and velocities current: nothing of constraints."""
+    model, model.opt = copy.copy(model), copy.copy(model.opt)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    mjw.forward(model, data)
 
 
 def _nothing(model: mjw.Model, data: mjw.Data) -> None:
     """Runs no kernel."""
 
 
-def _late_sensors(model: mujoco.MjModel) -> np.ndarray:
-    """Tells which numbers of `sensordata` need the acceleration, [nsensordata] bool."""
-    late = model.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC
-    return np.repeat(late, model.sensor_dim)
-
-
 def _known(model: mujoco.MjModel, changes: dict[str, Array]) -> dict[str, Array]:
     """Refuses changes of fields of which MJX-Warp has one value for the whole batch, or none."""
-    fields = [f.name for f in dataclasses.fields(mjw.Model) if _is_per_simulation(f.type)]
+    # Those that may differ between simulations have the type of an array [*, ...].
+    types = {f.name: getattr(f.type, "shape", ()) for f in dataclasses.fields(mjw.Model)}
+    fields = [name for name, shape in types.items() if shape[:1] == ("*",)]
     for name in changes:
         if name not in fields:
             what = "model field that can change on engine 'warp'"
@@ -231,20 +221,10 @@ def _known(model: mujoco.MjModel, changes: dict[str, Array]) -> dict[str, Array]
     return changes
 
 
-def _is_per_simulation(kind: Any) -> bool:
-    """Tells if a field of MJX-Warp's model, of this type, may differ between simulations."""
-    return getattr(kind, "shape", ())[:1] == ("*",)
-
-
 def _finite(size: int, trees: PyTree) -> Array:
     """Tells which simulations of trees [B, ...] have only finite numbers, [B] bool."""
     leaves = [jnp.isfinite(x).reshape(size, -1).all(axis=1) for x in jax.tree.leaves(trees)]
     return jnp.stack(leaves).all(axis=0)
-
-
-def _lose(lost: Array, state: PyTree) -> PyTree:
-    """Makes the state of one simulation NaN if it is `lost` [] bool."""
-    return jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), state)
 
 
 def _place_static_geoms(model: mujoco.MjModel, changes: dict[str, Array]) -> dict[str, Array]:

@@ -2,8 +2,7 @@
 
 To XLA a call of `jax.pure_callback` is a number that means something in one process, so JAX's
 cache keeps no program with one, and each start compiles it again. Here the function is one of XLA's
-foreign functions, which a program calls by name: whoever registers a function under that name must
-mean the same by it, in every process.
+foreign functions, which a program calls by name.
 
 The structures are those of XLA's C interface (`xla/ffi/api/c_api.h`, version 0.3), which jaxlib
 promises to call for a year at least after it changes. Each begins with its size and a pointer to
@@ -107,13 +106,12 @@ def _answer(function: Callable[[np.ndarray], np.ndarray], pointer: Any) -> int |
 
 def _asks_version(address: int | None) -> bool:
     """Tells XLA for which version of its interface this is written, if that is what it asks."""
-    if not address:
+    extension = ctypes.cast(address, ctypes.POINTER(_Extension)).contents if address else None
+    if extension is None or extension.type != _METADATA:
         return False
-    extension = ctypes.cast(address, ctypes.POINTER(_Extension)).contents
-    if extension.type == _METADATA:
-        version = extension.metadata.contents.version
-        version.major, version.minor = API_VERSION
-    return extension.type == _METADATA
+    version = extension.metadata.contents.version
+    version.major, version.minor = API_VERSION
+    return True
 
 
 def _array(buffers: _Buffers) -> np.ndarray:

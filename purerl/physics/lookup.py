@@ -82,9 +82,9 @@ def scale_action(model: mujoco.MjModel, action: Array) -> Array:
     Raises:
       ValueError: an actuator has no ctrlrange, so that -1 and 1 mean nothing.
     """
-    limited = model.actuator_ctrllimited.astype(bool)
-    if not limited.all():
-        open_ended = [n for n, ok in zip(names(model, "actuator"), limited, strict=True) if not ok]
+    limited = model.actuator_ctrllimited
+    open_ended = [n for n, ok in zip(names(model, "actuator"), limited, strict=True) if not ok]
+    if open_ended:
         raise ValueError(
             f"Actuators without a ctrlrange: {', '.join(open_ended)}. Give them one, so that an "
             "action in [-1, 1] has a meaning."
