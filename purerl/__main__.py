@@ -26,7 +26,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def console() -> None:
-    """Runs the console script `purerl`."""
+    """Runs the console script `purerl`, which finds modules where it is called, as `-m` does."""
+    sys.path.insert(0, "")
     leave(main)
 
 

@@ -23,7 +23,7 @@ from purerl.runs.command_line import carry_out
 class Options:
     """Compares runs: bit by bit where configuration and seed agree, else by statistics over seeds.
 
-    Ten seeds of this against ten of that: python -m purerl.compare 'runs/ant/a*' 'runs/ant/b*'
+    Ten seeds against ten others: python -m purerl.compare 'runs/ant_run/a*' 'runs/ant_run/b*'
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]

@@ -22,3 +22,8 @@ def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
         raise AttributeError(f"purerl.exact has no {name!r}; it has {', '.join(__all__)}.")
     return getattr(importlib.import_module(f"{__name__}.{_PUBLIC[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    """Lists the public names."""
+    return __all__

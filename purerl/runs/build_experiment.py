@@ -11,12 +11,12 @@ import jax.numpy as jnp
 
 from purerl.core.env import Env, EnvError
 from purerl.core.errors import RunError, UserError, one_line
-from purerl.core.records import Network, PyTree
+from purerl.core.records import Network, PolicyOutput, PyTree
 from purerl.devices.check_sizes import check_minibatches
 from purerl.devices.programs import abstract_state
 from purerl.ppo.config import Config
 from purerl.ppo.learner import is_recurrent
-from purerl.runs.check_env import check_members, check_shapes
+from purerl.runs.check_env import check_fields, check_members, check_shapes
 from purerl.runs.experiment import Experiment
 
 
@@ -40,6 +40,7 @@ def build(chosen: Experiment) -> Setup:
         check_members(env)
         with blame(env):
             state = jax.eval_shape(env.reset, jax.random.key(0))
+            check_fields(state)
             zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state.observation)
         network = chosen.build_network(chosen.network, zeros, env.action_size)
         setup = Setup(chosen.ppo, env, network, engine)
@@ -67,6 +68,11 @@ def _check_network(network: Network, observation: PyTree, action_size: int) -> N
         lambda x: jax.ShapeDtypeStruct((2, *x.shape), x.dtype), (observation, carry)
     )
     output, following = jax.eval_shape(network.apply, params, *batch)
+    if not isinstance(output, PolicyOutput):
+        raise ValueError(
+            f"The network's `apply` returned a {type(output).__name__} and a memory; it must be "
+            "a purerl.PolicyOutput and the memory."
+        )
     scalar, action = (2,), (2, action_size)
     normal = output.distribution
     answers = [("loc", normal.loc, action), ("scale", normal.scale, action)]

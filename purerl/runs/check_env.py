@@ -51,7 +51,7 @@ def check_shapes(env: Env) -> None:
     """Verifies what of the protocol shows without computing anything; EnvError as `check_env`."""
     check_members(env)
     fresh = jax.eval_shape(env.reset, jax.random.key(0))
-    _check_fields(fresh)
+    check_fields(fresh)
     action = jax.ShapeDtypeStruct((env.action_size,), jnp.float32)
     try:
         following = jax.eval_shape(env.step, fresh, action)
@@ -82,7 +82,7 @@ def check_members(env: Env) -> None:
         raise EnvError(f"env.action_size is {size!r}: it must be a positive int.")
 
 
-def _check_fields(state: Any) -> None:
+def check_fields(state: Any) -> None:
     """Checks the fields that every trainer reads, from the shapes of one fresh state."""
     if not isinstance(state, State):
         raise EnvError(f"reset returned a {type(state).__name__}: it must return env.State.")

@@ -12,7 +12,7 @@ class PlayOptions:
     """Which run's policy is played, from which checkpoint, and where."""
 
     run: Annotated[Path, tyro.conf.Positional]
-    """The run's folder, such as runs/ant/seed1."""
+    """The run's folder, such as runs/ant_run/seed1."""
     checkpoint: str = "latest"
     """latest, best (highest evaluation return), or an update's number."""
     seed: int = 0
@@ -59,8 +59,8 @@ class Options:
     video: bool = False
     """When training has ended, make a video of the policy, as `python -m purerl.render` does."""
     cache: bool = True
-    """Whether compiled programs are kept, in JAX_COMPILATION_CACHE_DIR, else in purerl/jax in
-    XDG_CACHE_HOME or ~/.cache."""
+    """Compiled programs are kept in JAX_COMPILATION_CACHE_DIR, else in purerl/jax in XDG_CACHE_HOME
+    or ~/.cache; with --no-cache they are not."""
 
     def __post_init__(self) -> None:
         """Checks the rules."""

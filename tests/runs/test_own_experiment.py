@@ -176,6 +176,32 @@ def test_a_network_whose_answers_have_other_shapes_is_one_line(place, capsys, wr
     assert len(said.strip().splitlines()) == 1 and message in said, said
 
 
+def test_a_network_that_returns_no_policy_output_is_one_line(place, capsys):
+    text = NETWORK.format(**SOUND)
+    start, end = text.index("PolicyOutput("), text.index(", carry\n")
+    (place / "mine.py").write_text(MINE + text[:start] + "loc" + text[end:])
+    assert train(place) == errors.USAGE
+    said = capsys.readouterr().err
+    assert len(said.strip().splitlines()) == 1 and "must be a purerl.PolicyOutput" in said, said
+
+
+def test_an_observation_of_integers_is_one_line(place, capsys):
+    whole = """class Mine(Env):
+    action_size = 1
+
+    def reset(self, key):
+        return super().reset(key).replace(observation=jnp.zeros(5, int))
+
+
+def build("""
+    text = MINE.replace("def build(", whole).replace("return Env(", "return Mine(")
+    (place / "mine.py").write_text(text)
+    assert train(place) == errors.USAGE
+    said = capsys.readouterr().err
+    assert len(said.strip().splitlines()) == 1 and "observation is int32 [5]" in said, said
+
+
+@pytest.mark.slow
 def test_a_sound_network_of_pure_functions_trains(place):
     (place / "mine.py").write_text(MINE + NETWORK.format(**SOUND))
     assert train(place) == errors.SUCCESS
