@@ -14,12 +14,13 @@ import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import tyro
 
 from purerl.core.errors import UserError, one_line, unknown_name
 from purerl.ppo.config import Config, Evaluation
+from purerl.runs.options import Engine
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Experiment:
     ppo: Config
     seed: Annotated[int, tyro.conf.arg(help="Seed of everything random in the run.")] = 1
     engine: Annotated[
-        Literal["auto", "c", "jax", "warp"],
+        Engine,
         tyro.conf.arg(
             help="Physics engine; auto: c (MuJoCo's C code) where JAX is on a CPU, else jax (MJX)."
         ),

@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+Engine = Literal["auto", "c", "jax", "warp"]
+
 
 @dataclass(frozen=True)
 class PlayOptions:
@@ -17,7 +19,7 @@ class PlayOptions:
     """latest, best (highest evaluation return), or an update's number."""
     seed: int = 0
     """Seed of the episodes; never meets a seed of training."""
-    engine: Literal["", "auto", "c", "jax", "warp"] = ""
+    engine: Literal["", Engine] = ""
     """Physics engine, where it should not be the run's own."""
 
 
