@@ -224,7 +224,7 @@ def _argmin(long: Long, eqn: core.JaxprEqn, value: Value) -> list[Value]:
     for number, row in enumerate(others, 1):
         less = _map(lambda a, b: (a < b) | ((a != a) & (b == b)), row, least)
         least = _map(jnp.where, less, row, least)
-        place = _map(lambda yes, p, i=number: jnp.where(yes, i, p), less, place)
+        place = _map(jnp.where, less, _map(lambda p, i=number: jnp.full_like(p, i), place), place)
     return [place]
 
 
@@ -241,21 +241,19 @@ def _slice(long: Long, eqn: core.JaxprEqn, value: Value) -> list[Value]:
 
 
 def _dynamic_slice(long: Long, eqn: core.JaxprEqn, value: Value, start: Value) -> list[Value]:
-    """One entry of [k], k short."""
-    return [_choose(start, _rows(value, 0)).reshape(1)]
+    """One entry of [k], k short; an index beyond the ends is the end's."""
+    found, *others = _rows(value, 0)
+    for number, row in enumerate(others, 1):
+        found = _map(lambda i, a, b, n=number: jnp.where(i >= n, a, b), start, row, found)
+    return [found.reshape(1)]
 
 
 def _cond(long: Long, eqn: core.JaxprEqn, index: Value, *args: Value) -> list[Value]:
     """All branches, then a choice."""
-    found = [_evaluate(long, branch, *args) for branch in eqn.params["branches"]]
-    return [_choose(index, cases) for cases in zip(*found, strict=True)]
-
-
-def _choose(index: Value, cases: Sequence[Value]) -> Value:
-    """Returns the case that has the number `index`; if none has, the first or the last."""
-    found = cases[0]
-    for number, case in enumerate(cases[1:], 1):
-        found = _map(lambda i, a, b, n=number: jnp.where(i >= n, a, b), index, case, found)
+    found, *others = (_evaluate(long, branch, *args) for branch in eqn.params["branches"])
+    for number, other in enumerate(others, 1):
+        chosen = _map(lambda i, n=number: i.astype(jnp.int32) >= n, index)
+        found = [_map(jnp.where, chosen, a, b) for a, b in zip(other, found, strict=True)]
     return found
 
 

@@ -17,13 +17,7 @@ _FEW_TERMS = 4
 def ordered_scatter(eqn: core.JaxprEqn, inputs: Sequence, inside: Inside) -> list[Array]:
     """Computes a scatter-add by gathers, which are added in the order of the updates.
 
-    Args:
-      eqn: the equation.
-      inputs: operand, indices and updates.
-      inside: not used.
-
-    Raises:
-      RuntimeError: the primitive is not a scatter-add, or its indices are not known.
+    Raises RuntimeError if it is another primitive, or if its indices are not known.
     """
     operand, indices, updates = inputs
     if not is_known(indices) or "add" not in eqn.primitive.name:
