@@ -113,7 +113,7 @@ class Batch:
                 f"MJX-Warp keeps {field!r} in {array.capacity} bytes and not in {like.capacity}: "
                 "this version of it is not one that purerl knows."
             )
-        view = wp.array(ptr=array.ptr, dtype=like.dtype, shape=like.shape, device=array.device)
+        view: Any = wp.array(ptr=array.ptr, dtype=like.dtype, shape=like.shape, device=array.device)
         self.views[field] = view
         return view
 
@@ -184,7 +184,7 @@ def make_call(
     def run(*arrays: wp.array) -> None:
         get_batch(wp.get_device()).call(name, stages, inputs, arrays)
 
-    dtypes = {f"in_{field}": wp.float32 for field in inputs}
+    dtypes: dict[str, Any] = {f"in_{field}": wp.float32 for field in inputs}
     dtypes |= {f"{f}_{i}": wp.int32 if f == "overflow" else wp.float32 for i, f in lengths}
     _declare(run, dtypes)
     call = wp.jax_callable(
@@ -211,7 +211,7 @@ def make_call(
 
 def _declare(function: Any, dtypes: dict[str, Any]) -> None:
     """Gives a function of any number of arrays [n] the names and types that Warp asks it for."""
-    types = {name: wp.array(dtype=dtype, ndim=1) for name, dtype in dtypes.items()}
+    types: dict[str, Any] = {n: wp.array(dtype=kind, ndim=1) for n, kind in dtypes.items()}
     named = inspect.Parameter.POSITIONAL_OR_KEYWORD
     parameters = [inspect.Parameter(name, named, annotation=one) for name, one in types.items()]
     function.__signature__ = inspect.Signature(parameters)
