@@ -160,7 +160,8 @@ def _module_name(path: Path) -> str:
     root = path.parent
     while (root / "__init__.py").exists():
         root = root.parent
-    if root != path.parent and str(root) in sys.path:
+    # "" stands for the folder that Python was started in.
+    if root != path.parent and root in {Path(place).absolute() for place in sys.path}:
         return ".".join(path.with_suffix("").relative_to(root).parts)
     return f"purerl_experiment_{path.stem}"
 
