@@ -64,6 +64,7 @@ def test_contract(name, engine):
     check_env(build(name, engine), num_envs=NUMBER)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BUILDERS)
 def test_engines_agree(name):
     c, mjx = trajectory(name, "c"), trajectory(name, "jax")

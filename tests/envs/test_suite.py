@@ -232,6 +232,7 @@ def _contacts(model, data, qpos) -> int:
     return data.ncon
 
 
+@pytest.mark.slow
 def test_random_joints_have_their_ranges():
     """Against dm_control's own draw, joint by joint: the same least and greatest."""
     for name in ("walker-stand", "humanoid-stand", "hopper-hop"):

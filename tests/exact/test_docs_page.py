@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -13,6 +15,7 @@ def blocks(kind):
     return re.findall(rf"```{kind}\n(.*?)```", (ROOT / "docs" / "exact.md").read_text(), re.S)
 
 
+@pytest.mark.slow
 def test_the_pages_code_prints_what_the_page_says():
     program = "\n".join(blocks("python"))
     environment = os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": ""}

@@ -171,6 +171,7 @@ ARM = """
 """
 
 
+@pytest.mark.slow
 def test_a_gradient_through_mjx_is_that_of_finite_differences():
     """In reverse mode MJX itself refuses more than one iteration of its solver."""
     model = mujoco.MjModel.from_xml_string(ARM)

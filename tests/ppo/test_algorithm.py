@@ -250,6 +250,7 @@ def test_segments_stay_whole_and_are_renewed_before_each_gradient_step(monkeypat
     assert {column.tobytes() for column in epoch.T} == {column.tobytes() for column in whole.T}
 
 
+@pytest.mark.slow
 def test_recurrent_memory_restarts_with_each_episode_in_rollout_and_learner():
     """The learner's unroll, from the stored memory, gives the rollout's values bit for bit."""
     env, network, state = setup(recurrent=True)

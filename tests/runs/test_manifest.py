@@ -116,6 +116,7 @@ def test_kernels_are_fixed_unless_the_user_wants_them_timed(monkeypatch, users, 
     assert ["by timing" in reason for reason in reasons] == [True] * (chosen == "by timing")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["cartpole_swingup", "ant_run"])
 def test_no_update_has_a_sum_without_a_fixed_order(name):
     source = load(ROOT / "experiments" / f"{name}.py").experiment

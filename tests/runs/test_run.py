@@ -345,6 +345,7 @@ def test_a_last_checkpoint_that_fails_is_an_error(tmp_path, monkeypatch, capsys)
     assert "The last checkpoint could not be saved" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "reason", "update"),
     [
