@@ -12,7 +12,12 @@ COMPILED = os.path.join(tempfile.gettempdir(), "purerl-test-compilations")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", COMPILED)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
+import hypothesis  # noqa: E402
 import jax  # noqa: E402
+
+# The same examples every time: a failure belongs to the change that is tested.
+hypothesis.settings.register_profile("same", derandomize=True, deadline=None)
+hypothesis.settings.load_profile("same")
 
 jax.config.update("jax_debug_key_reuse", True)  # a key consumed twice raises
 
