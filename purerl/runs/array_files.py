@@ -1,7 +1,6 @@
 """A folder of arrays on the disk, as Orbax writes and reads it: the one module that knows Orbax."""
 
 import logging
-import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,45 +9,30 @@ import jax
 import numpy as np
 
 
-def write(path: Path, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
-    """Writes arrays and JSON values as one folder, which appears whole or not at all."""
-    args = _orbax().args
-    whole = args.Composite(state=args.StandardSave(arrays), meta=args.JsonSave(meta))
+def write(folder: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Writes arrays into a new folder; raises what Orbax raises."""
     with _checkpointer() as checkpointer:
-        checkpointer.save(path.absolute(), whole)
+        checkpointer.save(folder.absolute(), _orbax().args.PyTreeSave(arrays))
 
 
-def read(path: Path, like: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def read(folder: Path, like: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Reads arrays of the names, shapes and dtypes of `like`; raises what Orbax raises."""
-    args = _orbax().args
+    ocp = _orbax()
+    kinds = {key: ocp.RestoreArgs(np.ndarray, dtype=x.dtype) for key, x in like.items()}
+    wanted = ocp.args.PyTreeRestore(like, restore_args=kinds, partial_restore=True)
     with _checkpointer() as checkpointer:
-        wanted = args.Composite(state=args.StandardRestore(like))
-        return checkpointer.restore(path.absolute(), wanted).state
-
-
-def flush(path: Path) -> None:
-    """Forces a checkpoint to the disk before an older one is deleted: Orbax calls no fsync."""
-    for file in [*path.rglob("*"), path, path.parent]:
-        handle = os.open(file, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+        return checkpointer.restore(folder.absolute(), wanted)
 
 
 def _checkpointer() -> Any:
     """Returns what saves and loads; of several processes the first does, without the others."""
     ocp = _orbax()
     if jax.process_count() == 1:
-        return ocp.Checkpointer(ocp.CompositeCheckpointHandler())
+        return ocp.Checkpointer(ocp.PyTreeCheckpointHandler())
     alone = ocp.options.MultiprocessingOptions(
         primary_host=0, active_processes={0}, barrier_sync_key_prefix="first"
     )
-    handler = ocp.CompositeCheckpointHandler(
-        state=ocp.StandardCheckpointHandler(multiprocessing_options=alone),
-        meta=ocp.JsonCheckpointHandler(multiprocessing_options=alone),
-        composite_options=ocp.CompositeOptions(multiprocessing_options=alone),
-    )
+    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=alone)
     return ocp.Checkpointer(handler, multiprocessing_options=alone)
 
 

@@ -1,12 +1,14 @@
-"""Checkpoints: a whole TrainState on disk, with a hash of every leaf, so that damage is noticed.
+"""Checkpoints: a whole TrainState on disk, with a hash of every file and leaf.
 
-Orbax commits a checkpoint by renaming a finished folder, which survives a kill at any moment. But
-it checks no array bytes, deletes in place, and mistakes the latest step on a full disk. So hashes
-are kept beside the arrays, and `checkpoint_folder.py` looks after the folder.
+A checkpoint is written under another name, flushed to the disk, and then renamed: what bears its
+name is whole, after a kill and after a power cut. Orbax writes and reads the arrays, but checks no
+byte of them. So hashes are kept beside them, and `checkpoint_folder.py` looks after the folder.
 """
 
 import contextlib
 import hashlib
+import json
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +20,9 @@ import numpy as np
 from purerl.core.errors import UserError, one_line
 from purerl.core.records import PyTree
 from purerl.runs import array_files, checkpoint_folder
-from purerl.runs.checkpoint_folder import DamagedError, load_meta, path_of
+from purerl.runs.checkpoint_folder import META, WRITING, DamagedError, load_meta, path_of, verify
+from purerl.runs.files import hash_files, sync, sync_tree
+from purerl.runs.identity import Owner, check_owner
 from purerl.runs.state_arrays import Leaves, digest_leaves, leaf_paths, raw, unflatten
 
 
@@ -40,51 +44,67 @@ def save(folder: Path, leaves: Leaves, meta: dict[str, Any]) -> Path:
     Raises:
       OSError or ValueError when the disk refuses; nothing partial is left behind.
     """
-    meta = meta | {"leaves": {path: _describe(array) for path, array in leaves.items()}}
     path = path_of(folder, meta["update"])
-    checkpoint_folder.discard(path)
+    draft = path.with_name(WRITING + path.name)
     stored = {key: array for key, array in leaves.items() if array.size}  # Orbax refuses empty ones
     try:
-        array_files.write(path, stored, meta | {"meta_sha256": checkpoint_folder.hash_meta(meta)})
-        array_files.flush(path)
-    except BaseException:
+        shutil.rmtree(draft, ignore_errors=True)
+        draft.mkdir()
+        array_files.write(draft / "state", stored)
+        meta = meta | {"leaves": {key: _describe(array) for key, array in leaves.items()}}
+        meta["files"] = hash_files(draft)
+        meta["meta_sha256"] = checkpoint_folder.hash_meta(meta)
+        (draft / META).write_text(json.dumps(meta))
+        sync_tree(draft)
         checkpoint_folder.discard(path)
+        draft.rename(path)
+        sync(folder)
+    except BaseException:
         checkpoint_folder.clean(folder)
         raise
     return path
 
 
-def load(path: Path, abstract: PyTree) -> Saved:
+def load(path: Path, abstract: PyTree, owners: Sequence[Owner] = ()) -> Saved:
     """Reads one checkpoint and checks every hash.
 
     Args:
       path: of one update.
       abstract: shapes of the state. A field of it that is None is left out, whatever was saved.
+      owners: whose checkpoint it may be; none: anybody's.
 
     Raises:
-      DamagedError: a file or a leaf is not what was written.
-      UserError: it is whole, but of another state than `abstract` (other sizes or networks).
+      DamagedError: a file is not what was written.
+      UserError: it cannot be read, or it is whole, but another run's, or of another state than
+        `abstract` (other sizes or networks).
     """
     meta = load_meta(path)
-    _check_fits(path, meta, abstract)
-    stored = meta["leaves"].items()
-    leaves = {key: np.zeros(about["shape"], jnp.dtype(about["dtype"])) for key, about in stored}
+    check_owner(path, meta, owners)
+    wanted = _check_fits(path, meta, abstract)
+    verify(path)
+    leaves = {key: np.zeros(shape, jnp.dtype(dtype)) for key, (dtype, shape) in wanted.items()}
     try:
-        leaves |= array_files.read(path, {key: x for key, x in leaves.items() if x.size})
-    except (PermissionError, MemoryError) as error:  # no damage: it shall not be put aside
-        raise UserError(f"The checkpoint {path} cannot be read: {one_line(error)}") from error
-    except Exception as error:  # Orbax raises many kinds for broken files, none of them its own
-        raise DamagedError(f"its arrays cannot be read ({type(error).__name__})") from error
-    for key, about in stored:
-        if _describe(leaves[key]) != about:
-            raise DamagedError(f"leaf {key} is not what was written (sha256 differs)")
-    if digest_leaves(leaves) != meta["digest"]:
-        raise DamagedError("the digest of all leaves differs from the one written with them")
+        read = array_files.read(path / "state", {key: x for key, x in leaves.items() if x.size})
+        leaves |= {key: read[key] for key in leaves.keys() & read.keys()}
+        for key, array in leaves.items():
+            if _describe(array) != meta["leaves"][key]:
+                raise ValueError(f"leaf {key} comes back otherwise (sha256 differs)")
+        if leaves.keys() == meta["leaves"].keys() and digest_leaves(leaves) != meta["digest"]:
+            raise ValueError("the digest of all leaves is another")
+    except Exception as error:  # Orbax raises many kinds. Its files are what it wrote, so:
+        raise UserError(
+            f"The checkpoint {path} is whole on the disk, but cannot be read: {one_line(error)}. "
+            "Nothing was changed: mend the installation, the memory or the limits of this process."
+        ) from error
     return Saved(unflatten(leaves, abstract), meta)
 
 
 def newest(
-    folders: Sequence[Path], abstract: PyTree, say: Callable[[str], None], rename: bool = True
+    folders: Sequence[Path],
+    abstract: PyTree,
+    say: Callable[[str], None],
+    rename: bool = True,
+    owners: Sequence[Sequence[Owner]] = (),
 ) -> list[Saved]:
     """Reads the newest update that all folders hold whole.
 
@@ -93,16 +113,19 @@ def newest(
       abstract: shapes of one seed's state.
       say: told of each damaged checkpoint.
       rename: whether to rename damaged ones; False where another process may write the run.
+      owners: whose checkpoints those of each folder may be.
 
     Returns:
       One checkpoint for each folder; [] if there is no such update.
     """
+    for folder in folders if rename else ():
+        checkpoint_folder.take_back(folder, say)
     for update in reversed(checkpoint_folder.common_updates(folders)):
         found = []
-        for folder in folders:
+        for folder, of in zip(folders, owners or [()] * len(folders), strict=True):
             path = path_of(folder, update)
             try:
-                found.append(load(path, abstract))
+                found.append(load(path, abstract, of))
             except DamagedError as error:
                 kept = checkpoint_folder.set_aside(path) if rename else path
                 say(f"Checkpoint of update {update} is damaged: {error}. It is kept as {kept}; "
@@ -126,11 +149,12 @@ def _describe(array: np.ndarray) -> dict[str, Any]:
     return {"dtype": str(array.dtype), "shape": list(array.shape), "sha256": content}
 
 
-def _check_fits(path: Path, meta: dict[str, Any], abstract: PyTree) -> None:
-    shapes = [[str(x.dtype), list(x.shape)] for x in jax.tree.leaves(jax.eval_shape(raw, abstract))]
+def _check_fits(path: Path, meta: dict[str, Any], abstract: PyTree) -> dict[str, tuple]:
+    """Returns each leaf's dtype and shape; UserError if those that were saved are others."""
+    shapes = [(str(x.dtype), list(x.shape)) for x in jax.tree.leaves(jax.eval_shape(raw, abstract))]
     wanted = dict(zip(leaf_paths(abstract), shapes, strict=True))
     stored = {
-        key: [about["dtype"], about["shape"]]
+        key: (about["dtype"], about["shape"])
         for key, about in meta["leaves"].items()
         if getattr(abstract, key.partition("/")[0], key) is not None  # None: left out
     }
@@ -138,6 +162,11 @@ def _check_fits(path: Path, meta: dict[str, Any], abstract: PyTree) -> None:
         if wanted.get(key) != stored.get(key):
             raise UserError(
                 f"The checkpoint {path} is of another state: leaf {key} is "
-                f"{stored.get(key, 'absent')} in it and {wanted.get(key, 'absent')} in this "
+                f"{_shown(stored.get(key))} in it and {_shown(wanted.get(key))} in this "
                 "experiment. Use the settings and the version of purerl that the run began with."
             )
+    return wanted
+
+
+def _shown(leaf: tuple | None) -> str:
+    return "absent" if leaf is None else str(list(leaf))

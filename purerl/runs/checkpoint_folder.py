@@ -1,22 +1,33 @@
 """The folder `checkpoints/` of a run: which updates it holds, their metadata, what may go. No JAX.
 
-A checkpoint is a folder named after its update. Its metadata hold a hash of themselves, so that
-damage is noticed. `checkpoint.py` reads and writes the arrays.
+A checkpoint is a folder named after its update: `state/`, which Orbax writes, and `meta.json`, with
+the sha256 of each file, of each leaf and of itself, and whose checkpoint it is. What cannot be read
+may be whole, so nothing is called damaged but what was read and has another hash.
 """
 
 import contextlib
 import hashlib
 import json
+import re
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from purerl.core.errors import UserError
+from purerl.core.errors import UserError, one_line
+from purerl.runs.files import hash_file, sync
+
+META = "meta.json"
+KINDS = {
+    "update": int, "steps": int, "wall_s": float, "digest": str, "metrics_bytes": int,
+    "metrics_sha256": str, "leaves": dict, "files": dict,
+}  # fmt: skip
+LEAF = {"dtype", "shape", "sha256"}
+WRITING, DELETING = ".writing-", ".deleting-"
 
 
 class DamagedError(Exception):
-    """A checkpoint that cannot be read whole; the message names the leaf or the file."""
+    """A checkpoint that is not what was written; the message names the file."""
 
 
 def path_of(folder: Path, update: int) -> Path:
@@ -24,16 +35,50 @@ def path_of(folder: Path, update: int) -> Path:
     return folder / f"{update:012d}"
 
 
-def load_meta(path: Path) -> dict[str, Any]:
-    """Reads a checkpoint's metadata; DamagedError unless it is what was written."""
+@contextlib.contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Tells what cannot be read from what is damaged: a UserError, and all stays as it is."""
     try:
-        meta = json.loads((path / "meta" / "metadata").read_text())
+        yield
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise DamagedError(f"{Path(str(error.filename)).name} is missing") from error
+    except OSError as error:
+        raise UserError(
+            f"The checkpoint {path} cannot be read: {one_line(error)}. It may be whole, and is "
+            "kept as it is: mend that, and give the same command again."
+        ) from error
+
+
+def load_meta(path: Path) -> dict[str, Any]:
+    """Reads a checkpoint's metadata.
+
+    Raises:
+      DamagedError: it is not what was written.
+      UserError: it cannot be read, or was written by another program or version.
+    """
+    with reading(path):
+        text = (path / META).read_bytes()
+    try:
+        meta = json.loads(text)
         expected = meta.pop("meta_sha256")
-    except (OSError, ValueError, KeyError, AttributeError) as error:
-        raise DamagedError(f"its metadata cannot be read ({type(error).__name__})") from error
+    except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
+        raise DamagedError(f"{META} is cut or overwritten ({type(error).__name__})") from error
     if hash_meta(meta) != expected:
-        raise DamagedError("its metadata is not what was written (sha256 differs)")
+        raise DamagedError(f"{META} is not what was written (sha256 differs)")
+    _check_kinds(path / META, meta)
     return meta
+
+
+def _check_kinds(file: Path, meta: dict[str, Any]) -> None:
+    """Raises UserError if metadata are not laid out as this version of purerl writes them."""
+    wrong = [name for name, kind in KINDS.items() if not isinstance(meta.get(name), kind)]
+    if not wrong and any(leaf.keys() != LEAF for leaf in meta["leaves"].values()):
+        wrong = ["leaves"]
+    if wrong:
+        raise UserError(
+            f"{file} is of another program or version of purerl: its {wrong[0]} is "
+            f"{meta.get(wrong[0])!s:.60}."
+        )
 
 
 def hash_meta(meta: dict[str, Any]) -> str:
@@ -41,11 +86,40 @@ def hash_meta(meta: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(meta, sort_keys=True).encode()).hexdigest()
 
 
+def verify(path: Path) -> dict[str, Any]:
+    """Returns a checkpoint's metadata after comparing every file with its hash.
+
+    Raises:
+      DamagedError: a file is not what was written.
+      UserError: a file cannot be read, or the checkpoint is of another update than its name says.
+    """
+    meta = load_meta(path)
+    if path_of(path.parent, meta["update"]) != path and path.name.isdigit():
+        raise UserError(
+            f"The checkpoint {path} is of update {meta['update']}: it has been renamed. Name it "
+            f"{path_of(path.parent, meta['update']).name}, or move it out of the folder."
+        )
+    for name, expected in meta["files"].items():
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            raise UserError(f"{path / META} names a file outside of the checkpoint: {name!r}.")
+        with reading(path):
+            found = hash_file(path / name)
+        if found != expected:
+            raise DamagedError(f"{name} is not what was written (sha256 differs)")
+    return meta
+
+
 def updates(folder: Path) -> list[int]:
     """Returns the updates that have a checkpoint, oldest first; it may be damaged."""
     if not folder.is_dir():
         return []
-    return sorted(int(d.name) for d in folder.iterdir() if d.name.isdigit() and d.is_dir())
+    names = [path.name for path in folder.iterdir() if path.is_dir()]
+    return sorted(int(name) for name in names if re.fullmatch(r"[0-9]{12}", name))
+
+
+def holds_any(folder: Path) -> bool:
+    """Tells whether there is a checkpoint, or one that was set aside."""
+    return bool(updates(folder)) or any(folder.glob("damaged-*"))
 
 
 def common_updates(folders: Iterable[Path]) -> list[int]:
@@ -58,25 +132,28 @@ def best_update(folder: Path) -> int | None:
     scored = []
     for update in updates(folder):
         with contextlib.suppress(DamagedError):
-            score = load_meta(path_of(folder, update))["eval_return"]
-            scored += [(score, update)] if score is not None else []
+            score = load_meta(path_of(folder, update)).get("eval_return")
+            scored += [(score, update)] if isinstance(score, float) else []
     return max(scored)[1] if scored else None
 
 
-def check_none_lost(folders: Sequence[Path]) -> None:
+def check_none_lost(folders: Sequence[Path], promised: bool) -> None:
     """Raises UserError where there were checkpoints: a run does not silently begin again.
 
-    A kill during the first save leaves no checkpoint, or one for some of the seeds that train
-    together.
+    Args:
+      folders: the checkpoints of each of the seeds that train together. A kill during the first
+        save leaves none, or one for some of the seeds.
+      promised: whether manifest.json says that all of them had one.
     """
     for folder in folders:
         damaged = sorted(path.name for path in folder.glob("damaged-*"))
-        if damaged or len(updates(folder)) > 1:
+        if damaged or promised or len(updates(folder)) > 1:
             kept = ", ".join([*damaged, *map(str, updates(folder))])
             shared = " that all seeds have" if len(folders) > 1 else ""
             raise UserError(
-                f"{folder} holds no whole checkpoint{shared}, but {kept}: there is nothing to go "
-                "on from. Train anew under another --name."
+                f"{folder} holds no whole checkpoint{shared}, but {kept or 'it had'}: there is "
+                "nothing to go on from. Bring one back from a copy, or train anew under another "
+                "--name."
             )
 
 
@@ -105,16 +182,17 @@ def forget_after(folder: Path, last: int) -> None:
 def discard(path: Path) -> None:
     """Deletes a checkpoint so that a kill in between leaves none that looks whole."""
     if path.exists():
-        doomed = path.with_name(f".deleting-{path.name}")
+        doomed = path.with_name(DELETING + path.name)
         shutil.rmtree(doomed, ignore_errors=True)
         path.rename(doomed)
+        sync(path.parent)
         shutil.rmtree(doomed, ignore_errors=True)
 
 
 def clean(folder: Path) -> None:
     """Removes what a crash or a full disk left: unfinished saves and unfinished deletions."""
     for path in folder.iterdir() if folder.is_dir() else ():
-        if "orbax-checkpoint-tmp" in path.name or path.name.startswith(".deleting-"):
+        if path.name.startswith((WRITING, DELETING)):
             shutil.rmtree(path, ignore_errors=True)
 
 
@@ -123,4 +201,20 @@ def set_aside(path: Path) -> Path:
     count = 0
     while (kept := path.with_name(f"damaged-{count}-{path.name}")).exists():
         count += 1
-    return path.rename(kept)
+    path.rename(kept)
+    sync(path.parent)
+    return kept
+
+
+def take_back(folder: Path, say: Callable[[str], None]) -> None:
+    """Looks again at what was set aside, and takes back what is whole: reading may have failed."""
+    for kept in sorted(folder.glob("damaged-*")):
+        parts = re.fullmatch(r"damaged-[0-9]+-([0-9]{12})", kept.name)
+        path = folder / parts[1] if parts else kept
+        if path.exists():
+            continue
+        with contextlib.suppress(DamagedError, UserError):
+            if path_of(folder, verify(kept)["update"]) == path:
+                kept.rename(path)
+                sync(folder)
+                say(f"{kept} is whole after all: it is the checkpoint {path} again.")

@@ -1,11 +1,9 @@
-"""What a run tells: metrics.jsonl, which is part of the run, and loggers, which are not.
+"""What a run tells: the figures of its updates, and loggers, which are no part of it.
 
-metrics.jsonl is exact: it holds the same lines whether the run was resumed or not. TensorBoard and
-W&B have threads of their own, for which training never waits.
+TensorBoard and W&B have threads of their own, for which training never waits.
 """
 
 import importlib.util
-import json
 import math
 import queue
 import threading
@@ -15,9 +13,9 @@ from typing import Any
 
 from purerl.core.errors import UserError, one_line
 from purerl.runs.files import read_json
+from purerl.runs.metrics_file import Record
 from purerl.runs.options import Options
 
-Record = dict[str, Any]
 Say = Callable[[str], None]
 
 MAX_SKIPPED_IN_A_ROW = 10  # minibatches; a run that skips so many cannot go on
@@ -45,42 +43,6 @@ def summarize(window: Sequence[Mapping[str, Any]]) -> Record:
         else:
             record[name] = sum(values) / len(values)
     return record
-
-
-class MetricsFile:
-    """metrics.jsonl: whole lines, written at once. A resumed run first cuts it back.
-
-    A line that the disk refuses is kept and written with the next one. So a disk that was full for
-    a while leaves no gap.
-    """
-
-    def __init__(self, path: Path, offset: int) -> None:
-        """Opens the file and forgets everything after `offset` [bytes]."""
-        self.file = path.open("ab", buffering=0)
-        if self.file.tell() < offset:
-            raise UserError(
-                f"{path} has {self.file.tell()} bytes, but the checkpoint was taken after "
-                f"{offset}: it has been cut or replaced. Start another run with --name."
-            )
-        self.file.truncate(offset)
-        self.offset = offset
-        self.pending = b""
-
-    def append(self, record: Record) -> int:
-        """Writes one line; returns the file's length after it [bytes]. OSError: not written yet."""
-        # JSON has no NaN and no infinity.
-        odd = {k: None for k, v in record.items() if isinstance(v, float) and not math.isfinite(v)}
-        self.pending += json.dumps(record | odd, allow_nan=False).encode() + b"\n"
-        try:
-            written = self.file.write(self.pending)
-            if written != len(self.pending):
-                raise OSError(f"only {written} of {len(self.pending)} bytes were written")
-        except OSError:
-            self.file.truncate(self.offset)
-            raise
-        self.offset += len(self.pending)
-        self.pending = b""
-        return self.offset
 
 
 class BackgroundLogger:

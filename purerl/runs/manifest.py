@@ -1,10 +1,8 @@
 """The manifest: all that a run's bits depend on besides its settings.
 
-A run writes it down at the start, `--resume` compares it, and checkpoints hold its fingerprint.
+A run writes it down at the start, and `--resume` compares it.
 """
 
-import hashlib
-import json
 import os
 import platform
 import subprocess
@@ -19,6 +17,7 @@ PACKAGES = ["jax", "jaxlib", "mujoco", "mujoco-mjx", "dm-control", "flax", "opta
 PACKAGES += ["orbax-checkpoint"]
 INFORMATIVE = {"run_id", "name", "git_revision", "git_dirty", "allowed_changes"}
 INFORMATIVE |= {"devices"}  # how many share the shards
+INFORMATIVE |= {"fingerprint", "had_checkpoint"}  # identity.py, run_folder.py
 # What these follow from is compared itself.
 INFORMATIVE |= {"experiment_file", "bit_exact", "inexact_because"}
 FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE", "JAX_PLATFORMS", "JAX_ENABLE_X64")
@@ -95,12 +94,6 @@ def cpu_threads() -> int:
     """Returns the size of XLA's CPU thread pool: NPROC where it is set, else the usable cores."""
     pinned = os.environ.get("NPROC", "") or os.environ.get("PJRT_NPROC", "")
     return int(pinned) if pinned.isdigit() else len(os.sched_getaffinity(0))
-
-
-def fingerprint(manifest: dict[str, Any]) -> str:
-    """Returns a sha256 over everything in the manifest that can change a run's bits."""
-    relevant = {key: value for key, value in manifest.items() if key not in INFORMATIVE}
-    return hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()
 
 
 def differences(old: Any, new: Any, path: str = "") -> list[str]:

@@ -1,25 +1,29 @@
 """A run's folder: who may write to it, what it says about the run, and how to rebuild it."""
 
 import contextlib
-import fcntl
-import os
-import shutil
 import uuid
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from purerl.core.errors import UserError
 from purerl.core.records import PyTree, TrainState
 from purerl.devices.programs import abstract_state
-from purerl.runs import checkpoint, checkpoint_folder, experiment, manifest
+from purerl.runs import checkpoint, checkpoint_folder, experiment, identity, manifest
 from purerl.runs.build_experiment import Setup, build, physics_hash
 from purerl.runs.experiment import Experiment, Source
-from purerl.runs.files import draft_of, read_json, runs_in, write_json
+from purerl.runs.files import (
+    draft_of,
+    make_folder,
+    read_json,
+    runs_in,
+    write_file,
+    write_json,
+)
+from purerl.runs.lock import LOCK
 from purerl.runs.loggers import Say
 from purerl.runs.source_hashes import module_file, source_hashes
 
-LOCK = ".lock"
 OURS = {LOCK, "config.json", "manifest.json", "experiment.py", "metrics.jsonl", "checkpoints"}
 MANY = 9  # edited files, which a refusal to resume then counts and does not list
 
@@ -33,24 +37,6 @@ class RestoredRun(NamedTuple):
 
 
 # --- beginning, and going on ---
-
-
-def lock(folder: Path) -> IO[str]:
-    """Makes the folder and locks it for this process, until the process ends in whatever way."""
-    folder.mkdir(parents=True, exist_ok=True)
-    handle = (folder / LOCK).open("a+")
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        handle.seek(0)
-        owner = handle.read().strip() or "unknown"
-        raise UserError(
-            f"The run {folder} is being written by process {owner}; stop that one first, or use "
-            "another --name."
-        ) from error
-    handle.truncate(0)
-    print(os.getpid(), file=handle, flush=True)
-    return handle
 
 
 @contextlib.contextmanager
@@ -81,6 +67,12 @@ def check_new_or_resume(folders: Iterable[Path], resume: bool) -> None:
         strange -= {draft_of(folder / name).name for name in OURS}  # of a run killed while starting
         if strange and not is_run:
             raise UserError(f"{folder} is no run (it holds {min(strange)}); use another --name.")
+        # config.json is written before all that a run learns.
+        if not is_run and checkpoint_folder.holds_any(folder / "checkpoints"):
+            raise UserError(
+                f"{folder} holds checkpoints, but its config.json is gone, which says what they "
+                "are of. Bring it back from a copy, or use another --name."
+            )
 
 
 def describe(source: Source, chosen: Experiment, schedule: dict[str, Any]) -> dict[str, Any]:
@@ -122,6 +114,7 @@ def begin_or_go_on(
     found += manifest.differences(old, facts)
     if (folder / "experiment.py").read_bytes() != source.path.read_bytes():
         found.append(f"experiment.py: {source.path} has been edited")
+    found += edited(folder)
     if found and not allow_changes:
         raise UserError(
             f"The run {folder} was begun under other conditions, so it would not go on exactly:\n  "
@@ -136,9 +129,21 @@ def begin_or_go_on(
 
 def _write(folder: Path, source: Source, settings: dict[str, Any], facts: dict[str, Any]) -> None:
     """Writes the three files that describe a run; config.json last, it makes it a run."""
-    shutil.copyfile(source.path, folder / "experiment.py")
+    code = source.path.read_bytes()
+    facts = facts | {"fingerprint": identity.fingerprint(settings, facts, code)}
+    make_folder(folder / "checkpoints")
+    write_file(folder / "experiment.py", code)
     write_json(folder / "manifest.json", facts)
     write_json(folder / "config.json", settings)
+
+
+def edited(folder: Path) -> list[str]:
+    """Returns a line if the three files that describe a run are not what it wrote."""
+    facts, config = read_json(folder / "manifest.json"), read_json(folder / "config.json")
+    code = (folder / "experiment.py").read_bytes()
+    if facts.get("fingerprint") == identity.fingerprint(config, facts, code):
+        return []
+    return ["fingerprint: config.json, manifest.json or experiment.py is not what the run wrote"]
 
 
 def _identity(folder: Path) -> dict[str, str]:
@@ -165,9 +170,32 @@ def _noted(folder: Path, old: dict[str, Any], found: list[str]) -> dict[str, Any
     known = {name: old[name] for name in ("run_id", "name")}
     after = max(checkpoint_folder.updates(folder / "checkpoints"), default=0)
     entry: dict[str, Any] = {"after_update": after, "changes": found}
+    entry["fingerprint"] = old["fingerprint"]
     if known["name"] != folder.name:
         entry, known = {"of": known} | entry, _identity(folder)
-    return known | {"allowed_changes": [*old.get("allowed_changes", []), entry]}
+    had = {name: old[name] for name in ("had_checkpoint",) if name in old}
+    return known | had | {"allowed_changes": [*old.get("allowed_changes", []), entry]}
+
+
+def signature(folder: Path) -> dict[str, Any]:
+    """Returns what the run's checkpoints say of whose they are."""
+    facts, config = read_json(folder / "manifest.json"), read_json(folder / "config.json")
+    return identity.signature(facts, config)
+
+
+def note_change(folder: Path, update: int, change: str) -> None:
+    """Notes in manifest.json something that --allow-changes let pass after `update`."""
+    facts = read_json(folder / "manifest.json")
+    entry = {"after_update": update, "changes": [change], "fingerprint": facts["fingerprint"]}
+    changes = [*facts.get("allowed_changes", []), entry]
+    write_json(folder / "manifest.json", facts | {"allowed_changes": changes})
+
+
+def note_checkpoint(folder: Path) -> None:
+    """Notes in manifest.json that the run has a checkpoint: it never again begins anew."""
+    facts = read_json(folder / "manifest.json")
+    if not facts.get("had_checkpoint"):
+        write_json(folder / "manifest.json", facts | {"had_checkpoint": True})
 
 
 # --- reading back ---
@@ -198,9 +226,11 @@ def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> Rest
     setup = build(chosen)
     for what in _changed_since(begun, source, setup):
         say(f"{what} is not that of the run any more.")
+    for what in edited(folder):
+        say(f"Edited since the run: {what}.")
     abstract = abstract_state(*setup[:3])
     abstract = abstract.replace(env=None, episode=None, optimizer=None)
-    return RestoredRun(chosen, setup, _choose(folder / "checkpoints", update, abstract, say))
+    return RestoredRun(chosen, setup, _choose(folder / "checkpoints", update, abstract, say, begun))
 
 
 def check_is_run(folder: Path) -> None:
@@ -235,10 +265,13 @@ def _fill(old: Any, new: Any, say: Say, path: str = "") -> Any:
     return new | {name: _fill(old[name], new.get(name), say, f"{path}{name}.") for name in old}
 
 
-def _choose(folder: Path, update: str, abstract: TrainState, say: Say) -> checkpoint.Saved:
+def _choose(
+    folder: Path, update: str, abstract: TrainState, say: Say, facts: dict[str, Any]
+) -> checkpoint.Saved:
     """Reads the checkpoint that was asked for; see `restore`."""
+    owners = identity.owners(facts)
     if update == "latest":
-        whole = checkpoint.newest([folder], abstract, say, rename=False)
+        whole = checkpoint.newest([folder], abstract, say, rename=False, owners=[owners])
         if not whole:
             raise UserError(f"{folder.parent} has no whole checkpoint yet.")
         return whole[0]
@@ -250,6 +283,6 @@ def _choose(folder: Path, update: str, abstract: TrainState, say: Say) -> checkp
         valid = ", ".join(["latest", "best", *found])
         raise UserError(f"There is no checkpoint {update!r} in {folder}. Valid: {valid}.")
     try:
-        return checkpoint.load(checkpoint_folder.path_of(folder, int(number)), abstract)
+        return checkpoint.load(checkpoint_folder.path_of(folder, int(number)), abstract, owners)
     except checkpoint_folder.DamagedError as error:
         raise UserError(f"The checkpoint of update {number} is damaged: {error}.") from error

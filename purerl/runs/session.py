@@ -7,6 +7,7 @@ an update that all of them have on the disk.
 """
 
 import functools
+import hashlib
 import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -32,15 +33,20 @@ from purerl.runs import (
     checkpoint,
     checkpoint_folder,
     console,
+    identity,
     loop,
     manifest,
     run_folder,
 )
 from purerl.runs.experiment import Experiment, Source
 from purerl.runs.files import read_json, write_json
+from purerl.runs.lock import RunLock
 from purerl.runs.loggers import Say, check_loggers, open_loggers
+from purerl.runs.metrics_file import MetricsFile, Record, keep_whole_lines
 from purerl.runs.options import Options
 from purerl.runs.writer import RunWriter
+
+NO_CHECKPOINT = {"update": 0, "metrics_bytes": 0, "metrics_sha256": hashlib.sha256().hexdigest()}
 
 
 class _Job(NamedTuple):
@@ -50,7 +56,7 @@ class _Job(NamedTuple):
     plan: loop.Plan
     programs: Callable[[], Programs]  # compiles them when it is first called
     abstract: PyTree  # shapes of one seed's state
-    facts: dict[str, Any]  # of manifest.json
+    locks: dict[Path, RunLock]  # of the folders; in the first process only
     stop: Callable[[], bool]  # tells whether a signal asked to stop
 
 
@@ -88,10 +94,13 @@ def execute(
         if options.vmapped_seeds > 1:
             facts["vmapped_seeds"] = {"first": chosen.seed, "number": options.vmapped_seeds}
 
+        locks: dict[Path, RunLock] = {}
+
         @run_folder.refusals()
         def prepare() -> bool:
             for folder in runs:
-                stack.enter_context(run_folder.lock(folder))
+                locks[folder] = RunLock(folder)
+                stack.callback(locks[folder].close)
             run_folder.check_new_or_resume(runs, options.resume)  # another may have been here
             for folder, one in runs.items():
                 settings = run_folder.describe(source, one, schedule)
@@ -116,7 +125,7 @@ def execute(
                 _tell_unordered(runs, exactness, made.unordered)
             return made
 
-        _train_all(runs, _Job(options, plan, programs, abstract, facts, stop))
+        _train_all(runs, _Job(options, plan, programs, abstract, locks, stop))
 
 
 def _tell_unordered(folders: Iterable[Path], exactness: dict[str, Any], places: list[str]) -> None:
@@ -187,9 +196,12 @@ def _train_together(job: _Job, folders: list[Path], seeds: list[int]) -> None:
         places = [folder / "checkpoints" for folder in folders]
 
         def find() -> dict[str, Any]:
-            saved.extend(checkpoint.newest(places, job.abstract, say))
+            facts = [read_json(folder / "manifest.json") for folder in folders]
+            owners = list(map(identity.owners, facts))
+            saved.extend(checkpoint.newest(places, job.abstract, say, owners=owners))
             if not saved:
-                checkpoint_folder.check_none_lost(places)
+                promised = any(one.get("had_checkpoint") for one in facts)
+                checkpoint_folder.check_none_lost(places, promised)
                 if job.options.resume:
                     say(f"There is no checkpoint in {places[0]}: it begins anew.")
             known = saved[0].meta if saved else {"wall_s": 0.0, "update": 0}
@@ -210,11 +222,10 @@ def _train_together(job: _Job, folders: list[Path], seeds: list[int]) -> None:
         writers: list[Any] = [processes.Silent(folder) for folder in folders]
         if processes.is_first():
             with run_folder.refusals():
-                writers = _open_writers(folders, saved, job.options, say)
+                writers = _open_writers(folders, saved, job, say)
             for folder, writer in zip(folders, writers, strict=True):
                 stack.callback(writer.close)
                 writer.loggers = open_loggers(job.options, folder, meta["update"], say)
-        meta["fingerprint"] = manifest.fingerprint(job.facts)
         stop = processes.agreed(job.stop)
         loop.train(plan, programs, programs.spread(state), writers, progress, stop, meta)
         for folder, writer in zip(folders, writers, strict=True):
@@ -241,15 +252,37 @@ def _first_state(
 
 
 def _open_writers(
-    folders: list[Path], saved: list[checkpoint.Saved], options: Options, say: Say
+    folders: list[Path], saved: list[checkpoint.Saved], job: _Job, say: Say
 ) -> list[RunWriter]:
     """Opens what writes each seed's folder, cut back to the checkpoints `saved`."""
     worker = ThreadPoolExecutor(1, "purerl-writer")
     together = [folder / "checkpoints" for folder in folders]
-    for place in together:
-        checkpoint_folder.forget_after(place, saved[0].meta["update"] if saved else 0)
-    offsets = [one.meta["metrics_bytes"] for one in saved] or [0] * len(folders)
-    return [
-        RunWriter(folder, offset, options.keep, say, worker, together)
-        for folder, offset in zip(folders, offsets, strict=True)
+    metas = [one.meta for one in saved] or [NO_CHECKPOINT] * len(folders)
+    files = [
+        _open_metrics(folder, meta, job.options.allow_changes, say)
+        for folder, meta in zip(folders, metas, strict=True)
     ]
+    for place in together:
+        checkpoint_folder.forget_after(place, metas[0]["update"])
+    return [
+        RunWriter(
+            job.locks[folder], file, run_folder.signature(folder), job.options.keep, say, worker,
+            together,
+        )
+        for folder, file in zip(folders, files, strict=True)
+    ]  # fmt: skip
+
+
+def _open_metrics(folder: Path, meta: Record, allow_changes: bool, say: Say) -> MetricsFile:
+    """Opens metrics.jsonl where a checkpoint left it; UserError if it is not what it was."""
+    path = folder / "metrics.jsonl"
+    try:
+        return MetricsFile(path, meta["metrics_bytes"], meta["metrics_sha256"])
+    except UserError:
+        if not allow_changes:
+            raise
+    change = f"{path.name}: it was not what the run wrote; its whole lines are kept"
+    say(change)
+    place = keep_whole_lines(path, meta["update"])
+    run_folder.note_change(folder, meta["update"], change)
+    return MetricsFile(path, *place)

@@ -1,6 +1,7 @@
 """A state as named arrays on the host, `{path: array}`, and its digest.
 
-A typed key travels as its raw data, and its path ends in `|<implementation>`.
+A typed key travels as its raw data, and its path ends in `|<implementation>`. In a name, `~`, `/`
+and `|` are written as `~0`, `~1` and `~2` (after RFC 6901), so that no two leaves share a path.
 """
 
 import hashlib
@@ -18,10 +19,15 @@ Leaves = dict[str, np.ndarray]
 def leaf_paths(state: PyTree) -> list[str]:
     """Returns the path of every leaf, in the order of `jax.tree.leaves`; abstract states too."""
     return [
-        jax.tree_util.keystr(path, simple=True, separator="/")
-        + (f"|{_impl(leaf)}" if is_key(leaf) else "")
+        "/".join(map(_name, path)) + (f"|{_impl(leaf)}" if is_key(leaf) else "")
         for path, leaf in jax.tree_util.tree_leaves_with_path(state)
     ]
+
+
+def _name(entry: Any) -> str:
+    """Returns one part of a leaf's path."""
+    name = jax.tree_util.keystr((entry,), simple=True)
+    return name.replace("~", "~0").replace("/", "~1").replace("|", "~2")
 
 
 def raw(state: PyTree) -> PyTree:

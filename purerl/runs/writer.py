@@ -1,7 +1,7 @@
 """Writes a run's metrics and checkpoints, in order, from one background thread.
 
-The order matters: a checkpoint says how long metrics.jsonl was when it was taken. Training does not
-wait for hashes or the disk.
+The order matters: a checkpoint says how long metrics.jsonl was when it was taken, and is written
+when the disk has all of that. Training does not wait for hashes or the disk.
 """
 
 from collections.abc import Sequence
@@ -9,10 +9,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from purerl.core.errors import RunError, one_line
-from purerl.runs import checkpoint, checkpoint_folder
-from purerl.runs.loggers import BackgroundLogger, MetricsFile, Record, Say
+from purerl.core.errors import RunError, UserError, one_line
+from purerl.runs import checkpoint, checkpoint_folder, run_folder
+from purerl.runs.files import make_folder
+from purerl.runs.lock import RunLock
+from purerl.runs.loggers import BackgroundLogger, Say
+from purerl.runs.metrics_file import MetricsFile, Record
 from purerl.runs.state_arrays import Leaves, digest_leaves
+
+TRIES = 2  # to save a checkpoint: many a fault passes
 
 
 class RunWriter:
@@ -20,18 +25,20 @@ class RunWriter:
 
     def __init__(
         self,
-        folder: Path,
-        offset: int,
+        lock: RunLock,
+        metrics: MetricsFile,
+        signature: Record,
         keep: int,
         say: Say,
         worker: ThreadPoolExecutor,
         together: Sequence[Path],
     ) -> None:
-        """Cuts metrics.jsonl back and clears what a crash left in checkpoints/.
+        """Clears what a crash left in checkpoints/.
 
         Args:
-          folder: the run's.
-          offset: where metrics.jsonl is to go on [bytes].
+          lock: on the run's folder.
+          metrics: the run's metrics.jsonl.
+          signature: what each checkpoint says of whose it is.
           keep: how many of the newest checkpoints stay.
           say: prints a line.
           worker: the one thread that writes. Seeds that train together share it, so that none is
@@ -39,17 +46,17 @@ class RunWriter:
           together: the checkpoint folders of the seeds that train together, this one's included.
             They keep the checkpoints that all of them have.
         """
-        self.checkpoints = folder / "checkpoints"
-        self.checkpoints.mkdir(exist_ok=True)
+        self.checkpoints = lock.folder / "checkpoints"
+        make_folder(self.checkpoints)
         checkpoint_folder.clean(self.checkpoints)
-        self.metrics = MetricsFile(folder / "metrics.jsonl", offset)
+        self.lock, self.metrics, self.signature = lock, metrics, signature
         self.keep, self.say, self.worker, self.together = keep, say, worker, together
         self.loggers: list[BackgroundLogger] = []
         self.last: Future[None] | None = None
         self.saving: Future[None] | None = None
         self.digest: str | None = None  # of the newest checkpoint written here
         self.failures = 0
-        self.last_failed = False  # whether the newest attempt to save failed
+        self.last_failure = ""  # why the newest checkpoint could not be saved; "": it could
 
     def write(self, record: Record) -> None:
         """Hands a line to the loggers, and to the thread that appends it to metrics.jsonl."""
@@ -74,10 +81,11 @@ class RunWriter:
         if self.last is not None:
             self.last.result()
         self.close()
-        if self.last_failed:
+        if self.last_failure:
             raise RunError(
-                f"The last checkpoint could not be saved ({self.failures} failed in all); the "
-                f"newest on the disk is {self._newest()}. Make room and go on with --resume."
+                f"The last checkpoint could not be saved ({self.failures} failed in all): "
+                f"{self.last_failure}. The newest on the disk is {self._newest()}. Mend that, and "
+                "go on with --resume."
             )
 
     def close(self) -> None:
@@ -96,23 +104,40 @@ class RunWriter:
         return self.last
 
     def _write(self, record: Record) -> None:
+        self.lock.check()
+        self.metrics.add(record)
         try:
-            self.metrics.append(record)
+            self.metrics.write()
         except OSError as error:
             self._failed(f"A line of metrics.jsonl could not be written: {one_line(error)}.")
 
     def _save(self, record: Record, leaves: Leaves, meta: dict[str, Any], planned: bool) -> None:
         digest = digest_leaves(leaves)
-        self.last_failed = True
+        self.metrics.add(record | {"digest": digest} if planned else record)
+        for left in reversed(range(TRIES)):
+            try:
+                self.lock.check()
+                about = meta | self.metrics.flush() | {"digest": digest, "run": self.signature}
+                checkpoint.save(self.checkpoints, leaves, about)
+                self.digest, self.last_failure = digest, ""
+                self._tidy()
+                return
+            except RunError:
+                raise
+            except Exception as error:  # Orbax reports a full disk as any of several kinds
+                self.last_failure = one_line(error)[:300]
+                if not left:
+                    what = f"The checkpoint of update {meta['update']} could not be saved"
+                    self._failed(f"{what}: {self.last_failure}. The newest is {self._newest()}.")
+
+    def _tidy(self) -> None:
+        """Notes that there is a checkpoint, and deletes old ones; a fault here loses nothing."""
         try:
-            offset = self.metrics.append(record | {"digest": digest} if planned else record)
-            meta = meta | {"digest": digest, "metrics_bytes": offset}
-            checkpoint.save(self.checkpoints, leaves, meta)
-            self.digest, self.last_failed = digest, False
+            if checkpoint_folder.common_updates(self.together):
+                run_folder.note_checkpoint(self.lock.folder)
             checkpoint_folder.retain(self.checkpoints, self.keep, self.together)
-        except Exception as error:  # Orbax reports a full disk as any of several kinds
-            what = f"The checkpoint of update {meta['update']} could not be saved"
-            self._failed(f"{what}: {one_line(error)[:300]}. The newest is {self._newest()}.")
+        except (OSError, UserError) as error:
+            self.say(f"An old checkpoint could not be deleted: {one_line(error)}")
 
     def _failed(self, message: str) -> None:
         self.failures += 1

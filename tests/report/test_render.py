@@ -365,6 +365,6 @@ def test_a_video_that_cannot_be_made_changes_nothing(trained, place, monkeypatch
     assert len(said) == 2  # before training and after it
     assert all("There is no video: MUJOCO_GL is 'disable'" in line for line in said)
     assert not (folder / "videos").exists()
-    saved = [path / "checkpoints" / "000000000003" / "meta" for path in (folder, trained)]
-    digests = [json.loads((path / "metadata").read_text())["digest"] for path in saved]
+    saved = [path / "checkpoints" / "000000000003" for path in (folder, trained)]
+    digests = [json.loads((path / "meta.json").read_text())["digest"] for path in saved]
     assert digests[0] == digests[1]

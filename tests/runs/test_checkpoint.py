@@ -32,10 +32,13 @@ def digest(state) -> str:
     return state_arrays.digest_leaves(state_arrays.flatten(state))
 
 
-def save(folder: Path, update: int, number: float | None = None, score: float | None = None):
+def save(
+    folder: Path, update: int, number: float | None = None, score: float | None = None, **more
+):
     leaves = state_arrays.flatten(make_state(float(update) if number is None else number))
     meta = {"update": update, "digest": state_arrays.digest_leaves(leaves), "eval_return": score}
-    return checkpoint.save(folder, leaves, meta)
+    meta |= {"steps": 8 * update, "wall_s": 0.5, "metrics_bytes": 0, "metrics_sha256": ""}
+    return checkpoint.save(folder, leaves, meta | more)
 
 
 def largest_file(path: Path) -> Path:
@@ -84,9 +87,8 @@ def test_flatten_copies():
         assert array.flags.owndata and array.flags.writeable, path
 
 
-def test_a_flipped_bit_is_noticed_and_its_leaf_named(tmp_path, monkeypatch):
-    # Orbax compresses small leaves, so a flip in the file may break more than one; the arrays that
-    # it hands back are the place to flip exactly one.
+def test_a_bit_flipped_after_reading_is_noticed_and_its_leaf_named(tmp_path, monkeypatch):
+    # The files are whole, so it is the memory, or Orbax: nothing is damaged.
     path = save(tmp_path, 1)
     read = array_files.read
 
@@ -96,25 +98,23 @@ def test_a_flipped_bit_is_noticed_and_its_leaf_named(tmp_path, monkeypatch):
         return leaves
 
     monkeypatch.setattr(array_files, "read", flipped)
-    with pytest.raises(checkpoint_folder.DamagedError, match="params/w.x"):
+    with pytest.raises(UserError, match="params/w.x"):
         checkpoint.load(path, abstract())
 
 
-def test_no_flipped_bit_of_any_array_file_loads_as_something_else(tmp_path):
+def test_no_flipped_bit_of_any_file_is_taken(tmp_path):
     path = save(tmp_path, 1)
-    good = digest(make_state(1.0))
-    file = largest_file(path)
-    content = file.read_bytes()
-    noticed = 0
-    for place in np.random.default_rng(0).integers(len(content) * 8, size=20):
-        damaged = bytearray(content)
-        damaged[place // 8] ^= 1 << (place % 8)
-        file.write_bytes(damaged)
-        try:
-            assert digest(checkpoint.load(path, abstract()).state) == good
-        except checkpoint_folder.DamagedError:
-            noticed += 1
-    assert noticed > 0
+    random = np.random.default_rng(0)
+    for file in sorted(f for f in path.rglob("*") if f.is_file()):
+        content = file.read_bytes()
+        for place in random.integers(len(content) * 8, size=4):
+            damaged = bytearray(content)
+            damaged[place // 8] ^= 1 << (place % 8)
+            file.write_bytes(damaged)
+            with pytest.raises(checkpoint_folder.DamagedError, match=file.name):
+                checkpoint.load(path, abstract())
+        file.write_bytes(content)
+    assert digest(checkpoint.load(path, abstract()).state) == digest(make_state(1.0))
 
 
 def damage_cut(path: Path):
@@ -123,12 +123,12 @@ def damage_cut(path: Path):
 
 
 def damage_meta(path: Path):
-    file = path / "meta" / "metadata"
+    file = path / "meta.json"
     file.write_text(file.read_text().replace('"update": 2', '"update": 3'))
 
 
 def damage_no_meta(path: Path):
-    (path / "meta" / "metadata").unlink()
+    (path / "meta.json").unlink()
 
 
 def damage_empty(path: Path):
@@ -173,6 +173,8 @@ def test_the_newest_and_the_best_are_kept(tmp_path):
 
 def test_of_seeds_together_those_are_kept_that_all_have(tmp_path):
     ahead, behind = tmp_path / "ahead", tmp_path / "behind"
+    ahead.mkdir()
+    behind.mkdir()
     for update in (1, 2, 3, 4):
         save(ahead, update)
     for update in (1, 2):
@@ -198,7 +200,7 @@ def test_a_failed_save_leaves_nothing_and_the_older_one_whole(tmp_path, monkeypa
     def full(path):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(array_files, "flush", full)
+    monkeypatch.setattr(checkpoint, "sync_tree", full)
     with pytest.raises(OSError, match="No space"):
         save(tmp_path, 2)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["000000000001"]

@@ -22,6 +22,7 @@ from purerl.ppo.config import Evaluation
 from purerl.runs import manifest
 from purerl.runs.build_experiment import build
 from purerl.runs.experiment import load
+from purerl.runs.identity import fingerprint
 
 ROOT = Path(__file__).parent.parent.parent
 TOY = Path(__file__).parent / "toy_experiment.py"
@@ -47,7 +48,7 @@ FACTS = st.dictionaries(NAMES.filter(lambda name: name not in manifest.INFORMATI
 def test_a_manifest_read_back_from_its_file_is_the_same(facts, name, value):
     read = json.loads(json.dumps(facts)) | {name: value}
     assert manifest.differences(facts, read) == manifest.differences(read, facts) == []
-    assert manifest.fingerprint(facts) == manifest.fingerprint(read)
+    assert fingerprint({}, facts, b"") == fingerprint({}, read, b"")
 
 
 def _counts(path):
@@ -62,14 +63,16 @@ def test_one_changed_value_is_named_and_nothing_else(facts, path):
 
     old, new = (with_value(facts, path, value) for value in ("before", "after"))
     assert manifest.differences(old, new) == [f"{'.'.join(path)}: before -> after"]
-    assert manifest.fingerprint(old) != manifest.fingerprint(new)
+    assert fingerprint({}, old, b"") != fingerprint({}, new, b"")
 
 
 def test_the_fingerprint_follows_what_can_change_bits_only():
     facts = manifest.collect("c", [])
-    same = manifest.fingerprint(facts | {"git_revision": "other", "run_id": "x"})
-    assert manifest.fingerprint(facts) == same
-    assert manifest.fingerprint(facts | {"engine": "jax"}) != same
+    mine = fingerprint({"seed": 1}, facts, b"source")
+    assert fingerprint({"seed": 1}, facts | {"git_revision": "x", "run_id": "x"}, b"source") == mine
+    others = [({"seed": 2}, facts, b"source"), ({"seed": 1}, facts | {"engine": "jax"}, b"source")]
+    for other in [*others, ({"seed": 1}, facts, b"edited")]:
+        assert fingerprint(*other) != mine
 
 
 def test_a_pinned_thread_pool_counts_as_pinned(monkeypatch):

@@ -30,6 +30,7 @@ from purerl.runs import (
     checkpoint_folder,
     command_errors,
     console,
+    files,
     run_folder,
     state_arrays,
     training,
@@ -175,12 +176,12 @@ def test_a_damaged_checkpoint_is_told_and_the_run_is_still_the_same(
     stop_after(14)
     start(tmp_path, "--checkpoints", "4")
     newest = folder(tmp_path) / "checkpoints" / f"{checkpoints(tmp_path)[-1]:012d}"
-    file = newest / "meta" / "metadata"
+    file = newest / "meta.json"
     file.write_text(file.read_text()[:-20])
     stop_after(10**9)
     assert start(tmp_path, "--checkpoints", "4", "--resume") == SUCCESS
     assert lines(tmp_path) == lines(whole)
-    assert "is damaged: its metadata cannot be read" in capsys.readouterr().out
+    assert "is damaged: meta.json is cut or overwritten" in capsys.readouterr().out
 
 
 def test_a_run_without_a_whole_checkpoint_does_not_silently_begin_again(
@@ -189,7 +190,7 @@ def test_a_run_without_a_whole_checkpoint_does_not_silently_begin_again(
     stop_after(14)
     start(tmp_path, "--checkpoints", "4")
     for update in checkpoints(tmp_path):
-        file = folder(tmp_path) / "checkpoints" / f"{update:012d}" / "meta" / "metadata"
+        file = folder(tmp_path) / "checkpoints" / f"{update:012d}" / "meta.json"
         file.write_text(file.read_text()[:-20])
     before = lines(tmp_path)
     stop_after(10**9)
@@ -453,7 +454,9 @@ def test_a_run_begun_under_other_conditions_lists_them(tmp_path, stop_after, cap
     stop_after(10**9)
     assert start(tmp_path, *words, "--allow-changes") == SUCCESS
     allowed = json.loads(file.read_text())["allowed_changes"]
-    assert allowed[0]["after_update"] > 0 and len(allowed[0]["changes"]) == 2
+    assert allowed[0]["after_update"] > 0
+    edited = "fingerprint: config.json, manifest.json or experiment.py is not what the run wrote"
+    assert len(allowed[0]["changes"]) == 3 and allowed[0]["changes"][-1] == edited
     assert json.loads(file.read_text())["run_id"] == facts["run_id"] and "of" not in allowed[0]
 
 
@@ -505,10 +508,11 @@ def test_the_time_left_carries_over(left, shown):
 
 
 def test_a_disk_that_is_full_at_the_start_is_one_line(tmp_path, monkeypatch, capsys):
-    def full(*_):
-        raise OSError(errno.ENOSPC, "No space left on device", "experiment.py")
+    def full(path):
+        if path.name == ".experiment.py.draft":
+            raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(run_folder.shutil, "copyfile", full)
+    monkeypatch.setattr(files, "sync", full)
     assert "experiment.py cannot be written: No space" in refused(capsys, start(tmp_path))
 
 

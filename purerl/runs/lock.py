@@ -1,0 +1,70 @@
+"""One process writes a run: it holds a lock on the folder, until it ends in whatever way."""
+
+import contextlib
+import errno
+import fcntl
+import os
+from pathlib import Path
+
+from purerl.core.errors import RunError, UserError
+from purerl.runs.files import make_folder
+
+LOCK = ".lock"
+# NFS locks no folder, and no read-only file; some file systems lock nothing at all.
+NO_LOCKS = {errno.EBADF, errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL}
+
+
+class RunLock:
+    """A run's folder, locked for this process.
+
+    The folder itself is locked, so that deleting a file in it changes nothing. Where the file
+    system locks no folder, the file `.lock` in it is. That file says who writes.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Makes the folder and locks it; UserError if another process writes it."""
+        make_folder(folder)
+        self.folder = folder
+        self.handles = [os.open(folder, os.O_RDONLY | os.O_DIRECTORY)]
+        try:
+            self.handles.append(os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o644))
+            self.locks = any(self._try(handle) for handle in self.handles)
+            os.ftruncate(self.handles[1], 0)
+            os.pwrite(self.handles[1], f"{os.getpid()}\n".encode(), 0)
+        except BaseException:
+            self.close()
+            raise
+
+    def _try(self, handle: int) -> bool:
+        """Locks a handle; False where the file system has no such lock."""
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            owner = os.pread(self.handles[1], 20, 0).decode(errors="replace").strip() or "unknown"
+            raise UserError(
+                f"The run {self.folder} is being written by process {owner}; stop that one first, "
+                "or use another --name."
+            ) from error
+        except OSError as error:
+            if error.errno in NO_LOCKS:
+                return False
+            raise
+        return True
+
+    def check(self) -> None:
+        """Raises RunError if the folder is no longer where it was."""
+        mine = os.fstat(self.handles[0])
+        with contextlib.suppress(OSError):
+            there = os.stat(self.folder)
+            if (mine.st_dev, mine.st_ino) == (there.st_dev, there.st_ino):
+                return
+        raise RunError(
+            f"The run's folder {self.folder} has been moved or removed while it trained; nothing "
+            "more can be saved there. Move it back, and go on with --resume."
+        )
+
+    def close(self) -> None:
+        """Gives the lock back."""
+        for handle in self.handles:
+            os.close(handle)
+        self.handles = []
