@@ -13,7 +13,7 @@ their file, names after fsync of their folder. What is not promised may be there
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -222,25 +222,25 @@ def _bytes_left(file: _File, model: str) -> bytes:
 
 
 def trees(
-    disk: Disk, changes: list[Change], every: int = 1, models: tuple[str, ...] = MODELS
+    disk: Disk, changes: list[Change], cuts: Container[int], models: Sequence[str] = MODELS
 ) -> Iterator[tuple[int, str, Tree]]:
-    """Yields the trees of a cut before the first change, and after every `every`-th and the last.
+    """Yields the trees that a power cut may leave.
 
     Args:
       disk: as it was before the changes.
       changes: a record.
-      every: of so many changes one cut is taken.
+      cuts: after how many of them there is a cut.
       models: of `MODELS`.
 
     Yields:
-      how many changes were made, the model, and the tree.
+      the cut, the model, and the tree.
     """
-    for number in range(len(changes) + 1):
-        if number:
-            disk.apply(changes[number - 1])
-        if number % every == 0 or number == len(changes):
+    for cut in range(len(changes) + 1):
+        if cut:
+            disk.apply(changes[cut - 1])
+        if cut in cuts:
             for model in models:
-                yield number, model, disk.tree(model)
+                yield cut, model, disk.tree(model)
 
 
 def write_tree(tree: Tree, folder: Path) -> None:
