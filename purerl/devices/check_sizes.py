@@ -1,5 +1,7 @@
 """Checks that sizes divide each other; each raises ValueError with sizes that do."""
 
+import math
+
 from purerl.devices.shards import Shards
 from purerl.ppo.config import Config
 
@@ -10,7 +12,8 @@ def check_divides(
     """Checks that `parts` divides `whole`; the message has the nearest sizes that do."""
     if whole % parts == 0:
         return
-    divisors = [d for d in range(1, whole + 1) if whole % d == 0]
+    small = [d for d in range(1, math.isqrt(whole) + 1) if whole % d == 0]
+    divisors = sorted({*small, *(whole // d for d in small)})
     nearest = sorted(sorted(divisors, key=lambda d: abs(d - parts))[:3])
     below, above = whole - whole % parts, whole - whole % parts + parts
     raise ValueError(

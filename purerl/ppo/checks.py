@@ -6,17 +6,19 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from purerl.core.records import PyTree
 
+COUNTS = 2**31  # int32, in which updates, samples and steps of an episode are counted, ends below
+SIZE = "at least 1 and below 2**31 - 1", lambda x: 1 <= x < COUNTS - 1
 # What a setting must be, how that is told, and the names of those that must be so.
 TRAINING = (
-    ("at least 1", lambda x: x >= 1, "num_envs rollout_length num_epochs num_minibatches"),
-    ("at least 1", lambda x: x >= 1, "episode_length"),
+    (*SIZE, "num_envs rollout_length num_epochs num_minibatches episode_length"),
+    ("at most 2**53", lambda x: x <= 2**53, "num_steps"),  # what reads metrics.jsonl has float64
     ("in [0, 1]", lambda x: 0.0 <= x <= 1.0, "gamma gae_lambda"),
     ("above 0", lambda x: x > 0.0, "learning_rate clip max_gradient_norm desired_kl reward_scale"),
     ("0 or above, and finite", lambda x: 0.0 <= x < math.inf, "value_weight entropy_weight"),
     ("0 or above", lambda x: x >= 0, "segment_length"),
 )
 EVALUATION = (
-    ("at least 1", lambda x: x >= 1, "num_episodes"),
+    (*SIZE, "num_episodes"),
     ("at least 0", lambda x: x >= 0, "number"),
 )
 
@@ -30,11 +32,16 @@ def check_rules(settings: Any, rules: tuple) -> None:
 
 
 def check_budget(config: Any) -> None:
-    """Checks that the run has at least one update."""
-    if config.num_updates < 1:
+    """Checks that the run has an update, and that int32 counts its samples and its updates."""
+    size = f"num_envs * rollout_length = {config.steps_per_update}"
+    if config.steps_per_update >= COUNTS:
+        raise ValueError(f"{size} must be below 2**31; lower one of the two.")
+    if not 1 <= config.num_updates < COUNTS:
+        wrong, cure = "less than one update", "raise num_steps or lower"
+        if config.num_updates:
+            wrong, cure = "2**31 updates or more", "lower num_steps or raise"
         raise ValueError(
-            f"num_steps is {config.num_steps}, less than one update of num_envs * rollout_length = "
-            f"{config.steps_per_update}; raise num_steps or lower one of the two."
+            f"num_steps is {config.num_steps}, {wrong} of {size}; {cure} one of the two."
         )
 
 

@@ -7,8 +7,8 @@ from purerl.ppo.config import Config
 
 
 def unfit(recurrent, **settings):
-    sizes = {"num_envs": 6, "rollout_length": 16, "num_minibatches": 3} | settings
-    config = Config(num_steps=6 * 16 * 100, **sizes)
+    sizes = {"num_envs": 6, "rollout_length": 16, "num_minibatches": 3, "num_steps": 6 * 16 * 100}
+    config = Config(**sizes | settings)
     with pytest.raises(ValueError) as error:
         check_minibatches(config, recurrent, config.num_envs)
     return str(error.value)
@@ -32,3 +32,10 @@ def test_segments_divide_rollouts_and_are_not_for_recurrent_networks():
     assert "segment_length is 8, and the network is recurrent" in unfit(True, segment_length=8)
     said = unfit(False, segment_length=5)
     assert all(word in said for word in ("segment_length = 5", "rollout_length = 16", "4"))
+
+
+@pytest.mark.timeout(20)
+def test_the_sizes_of_a_huge_rollout_are_found_at_once():
+    """One after another, 2**31 numbers took minutes."""
+    said = unfit(False, num_envs=2**16, rollout_length=2**14, num_minibatches=3, num_steps=2**53)
+    assert "num_minibatches could be 1, 2, 4" in said

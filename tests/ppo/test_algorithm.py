@@ -2,11 +2,13 @@
 
 import dataclasses
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, strategies as st
 
 from purerl.core.env import State
 from purerl.core.parts import WHOLE, as_one_part
@@ -474,11 +476,17 @@ def test_update_keeps_rank_promotion_strict():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"num_steps": 95}, ("num_steps is 95", "96")),
+        ({"num_steps": 95}, ("num_steps is 95", "96", "raise num_steps")),
         ({"gamma": 1.5}, ("gamma is 1.5", "[0, 1]")),
         ({"num_envs": 0}, ("num_envs is 0", "at least 1")),
         ({"clip": 0.0}, ("clip is 0.0", "above 0")),
         ({"segment_length": -4}, ("segment_length is -4", "0 or above")),
+        ({"num_steps": 2**53 + 1}, ("num_steps is 9007199254740993", "at most 2**53")),
+        ({"num_steps": 96 * 2**31}, ("2**31 updates or more", "= 96", "lower num_steps")),
+        ({"num_envs": 2**16, "rollout_length": 2**15}, (f"= {2**31} must be below 2**31;",)),
+        ({"num_envs": 2**31 - 1}, (f"num_envs is {2**31 - 1}", "below 2**31 - 1")),
+        ({"num_epochs": 2**31}, ("num_epochs", "below 2**31 - 1")),
+        ({"episode_length": 2**31 - 1}, ("episode_length", "below 2**31 - 1")),
     ],
 )
 def test_impossible_settings_are_refused(changes, words):
@@ -486,3 +494,36 @@ def test_impossible_settings_are_refused(changes, words):
         dataclasses.replace(CONFIG, **changes)
     for word in words:
         assert word in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "sizes",
+    [
+        {"num_envs": 2**16, "rollout_length": 2**15 - 1, "num_steps": 2**53},
+        {"episode_length": 2**31 - 2},
+        {"num_steps": 96 * (2**31 - 1), "schedule": "linear"},
+    ],
+)
+def test_whatever_settings_are_taken_can_be_counted(sizes):
+    """Traced, not computed: JAX refuses a number that it would have to turn round."""
+    config = dataclasses.replace(CONFIG, num_minibatches=1, **sizes)
+    start, step = (
+        partial(function, config, Walk(), NETWORKS[False])
+        for function in (algorithm.init, algorithm.update)
+    )
+    state = jax.eval_shape(start, jax.random.key(0))
+    assert jax.eval_shape(step, state)[0].update.dtype == jnp.int32
+
+
+@given(st.integers(1, 2**31 - 1), st.floats(0.0, 1.0, exclude_max=True))
+def test_the_linear_rate_is_right_up_to_the_last_update_that_can_be_counted(updates, where):
+    config = dataclasses.replace(
+        CONFIG, num_envs=1, rollout_length=1, num_minibatches=1, num_steps=updates,
+        schedule="linear", learning_rate=1.0,
+    )  # fmt: skip
+    assert config.num_updates == updates
+    for update in {0, int(where * updates), updates - 1}:
+        state = SimpleNamespace(update=jnp.int32(update))
+        rate = float(optimizer.scheduled_rate(config, state))
+        assert 0.0 <= rate <= 1.0
+        assert abs(rate - (1.0 - update / updates)) < 2e-7
