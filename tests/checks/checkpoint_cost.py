@@ -42,7 +42,12 @@ def main() -> None:
     jax.block_until_ready(state)
     with tempfile.TemporaryDirectory() as folder:
         leaves, holds_up = median(lambda: state_arrays.flatten(state))
-        meta = {"update": 1, "digest": state_arrays.digest_leaves(leaves), "steps": 0, "wall_s": 0.0}
+        meta = {
+            "update": 1,
+            "digest": state_arrays.digest_leaves(leaves),
+            "steps": 0,
+            "wall_s": 0.0,
+        }
         meta |= {"metrics_bytes": 0, "metrics_sha256": ""}
         path, writes = median(lambda: checkpoint.save(Path(folder), leaves, meta))
         restored, restores = median(lambda: checkpoint.load(path, abstract).state)
