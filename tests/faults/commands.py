@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import selectors
+import shutil
 import signal
 import subprocess
 import sys
@@ -30,6 +31,7 @@ class Answer(NamedTuple):
     fired: str = ""  # what the fault met, "" for nothing
     seconds: float = 0.0
     hung: bool = False
+    stuck: str = ""  # where a thread was left that would not let the process end
 
     @property
     def said(self) -> str:
@@ -134,6 +136,13 @@ def workplace() -> Iterator[tuple[Path, Worker]]:
             yield folder, worker
         finally:
             worker.end()
+
+
+def fresh(folder: Path) -> Path:
+    """Makes an empty folder, whatever was there."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
 
 
 def _read_line(stream: Any, timeout: float) -> str | None:

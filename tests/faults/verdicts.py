@@ -41,10 +41,8 @@ def undisturbed(worker: Worker, words: list[str], place: Path) -> Whole:
 
 def complaint(answer: Answer, place: Path, whole: Whole) -> str:
     """Returns what is wrong with a run that was taken to its end, in words; "" if nothing is."""
-    if answer.hung:
-        return "it hangs"
-    if "Traceback" in answer.said:
-        return f"a traceback: {_last_line(answer.err)}"
+    if ill := _ill(answer):
+        return ill
     if answer.code != SUCCESS:
         return f"exit code {answer.code}: {_last_line(answer.err)}"
     if aside := set_aside(place):
@@ -54,10 +52,8 @@ def complaint(answer: Answer, place: Path, whole: Whole) -> str:
 
 def untold(answer: Answer) -> str:
     """Returns what is wrong with how a command told its error, in words; "" if nothing is."""
-    if answer.hung:
-        return "it hangs"
-    if "Traceback" in answer.said or answer.code is None:
-        return f"a traceback: {_last_line(answer.err)}"
+    if ill := _ill(answer):
+        return ill
     if answer.code not in (FAILURE, USAGE, INTERRUPTED):
         return f"exit code {answer.code}"
     told = [line for line in answer.err.splitlines() if line.startswith("purerl: ")]
@@ -69,6 +65,12 @@ def untold(answer: Answer) -> str:
 def set_aside(place: Path) -> list[str]:
     """Returns the names of the checkpoints that a run has put aside as damaged."""
     return sorted(path.name for path in place.glob("runs/*/*/checkpoints/damaged-*"))
+
+
+def saved(place: Path) -> int:
+    """Returns the newest update that the run has a checkpoint of, 0 if there is none."""
+    found = place.glob("runs/*/*/checkpoints/[0-9]*")
+    return max((int(path.name) for path in found if path.name.isdigit()), default=0)
 
 
 def began_at(answer: Answer, whole: Whole) -> int:
@@ -84,6 +86,15 @@ def kind_of(text: str) -> str:
     text = re.sub(r"/[^\s:;,'\"]*/", "", text)
     text = re.sub(r"\b[0-9a-f]{12,}\b|\b\d+\b", "#", text)
     return text.split("\n")[0][:150]
+
+
+def _ill(answer: Answer) -> str:
+    """Returns what no command may do, in words; "" if it did not."""
+    if answer.hung:
+        return "it hangs"
+    if "Traceback" in answer.said or answer.code is None:
+        return f"a traceback: {_last_line(answer.err)}"
+    return "it would hang at its end" if answer.stuck else ""
 
 
 def _difference(place: Path, whole: Whole) -> str:
