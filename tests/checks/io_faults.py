@@ -248,7 +248,7 @@ def judge(
 def saved_by(answer: Answer, whole: Whole, before: int) -> int:
     """Returns the update that a command has said is saved, or that was saved `before` it."""
     if answer.code == SUCCESS:
-        return whole.lines[0][-1]["update"]
+        return verdicts.last(whole)
     stopped = re.search(r"Stopped after update (\d+) of \d+; it is saved", answer.err)
     return int(stopped[1]) if answer.code == INTERRUPTED and stopped else before
 

@@ -31,6 +31,7 @@ from tests.faults.verdicts import (
     command,
     complaint,
     kind_of,
+    last,
     saved,
     undisturbed,
 )
@@ -100,7 +101,7 @@ def cut_all(words: list[str], every: int, models: tuple[str, ...]) -> Found:
         whole = undisturbed(worker, words, fresh(folder / "whole"))
         recorded = record(worker, words, folder)
         changes = recorded.changes
-        print(f"a run of {whole.lines[0][-1]['update']} updates, stopped and resumed: "
+        print(f"a run of {last(whole)} updates, stopped and resumed: "
               f"{len(changes)} changes of files", flush=True)  # fmt: skip
         found = try_all(worker, whole, recorded, folder, cuts_after(changes, every), models)
     _print_table(found, models)
@@ -164,10 +165,10 @@ def try_all(
             wrong = f"it goes on after update {ended.began}, and {why} that {least} is saved"
         furthest[model] = least if ended.wrong else max(ended.began, least)
         if wrong:
-            last = str(changes[cut - 1]).replace(f"{root}/", "") if cut else "nothing"
+            change = str(changes[cut - 1]).replace(f"{root}/", "") if cut else "nothing"
             if kind_of(wrong) not in {kind_of(failure.wrong) for failure in failures}:
-                print(f"cut {cut} ({model}), after {last}: {wrong}\n{ended.said}", flush=True)
-            failures.append(Failure(cut, model, last, wrong, ended.said))
+                print(f"cut {cut} ({model}), after {change}: {wrong}\n{ended.said}", flush=True)
+            failures.append(Failure(cut, model, change, wrong, ended.said))
     return Found(len(cuts), len(known), failures)
 
 

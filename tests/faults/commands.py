@@ -99,10 +99,9 @@ class Worker:
         return Answer(None, "", f"{how}:\n{stacks}", "", seconds, hung)
 
     def _start(self) -> subprocess.Popen[str]:
-        flags = os.environ.get("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
         return subprocess.Popen(
             [sys.executable, "-m", "tests.faults.worker"],
-            env=shim.environment(self.library, XLA_FLAGS=flags),
+            env=shim.environment(self.library),
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors().open("w"),
             text=True,
         )  # fmt: skip

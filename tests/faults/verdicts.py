@@ -24,16 +24,25 @@ class Whole(NamedTuple):
     lines: list[list[dict[str, Any]]]  # of each seed's metrics.jsonl, without the clock
 
 
-def command(words: list[str], place: Path) -> list[str]:
+def go_on(words: list[str], place: Path) -> list[str]:
     """Returns the words of the run in `place`/runs; --resume, if there is something to resume."""
-    runs = place / "runs"
-    resume = ["--resume"] if find(runs, NAME) else []
-    return [*words, "--runs", str(runs), "--name", NAME, *resume]
+    return [*words, *(["--resume"] if find(place / "runs", NAME) else [])]
 
 
-def undisturbed(worker: Worker, words: list[str], place: Path) -> Whole:
+def command(words: list[str], place: Path) -> list[str]:
+    """Returns the same words, and where the run is."""
+    return [*go_on(words, place), "--runs", str(place / "runs"), "--name", NAME]
+
+
+def undisturbed(
+    worker: Worker,
+    words: list[str],
+    place: Path,
+    record: Path | None = None,
+    trace: Path | None = None,
+) -> Whole:
     """Makes the run without disturbing it; RuntimeError if even that fails."""
-    answer = worker.run(command(words, place), place)
+    answer = worker.run(command(words, place), place, record, trace)
     if answer.code != SUCCESS:
         raise RuntimeError(f"The undisturbed run ended with {answer.code}:\n{answer.said}")
     return Whole(words, read_lines(place / "runs", NAME))
@@ -76,7 +85,7 @@ def saved(place: Path) -> int:
 def began_at(answer: Answer, whole: Whole) -> int:
     """Returns the update after which a command went on, 0 if it began anew."""
     if "Already done" in answer.out:
-        return whole.lines[0][-1]["update"]
+        return last(whole)
     found = re.search(r"Resuming after update (\d+)", answer.out)
     return int(found[1]) if found else 0
 
@@ -86,6 +95,11 @@ def kind_of(text: str) -> str:
     text = re.sub(r"/[^\s:;,'\"]*/", "", text)
     text = re.sub(r"\b[0-9a-f]{12,}\b|\b\d+\b", "#", text)
     return text.split("\n")[0][:150]
+
+
+def last(whole: Whole) -> int:
+    """Returns the run's last update."""
+    return whole.lines[0][-1]["update"]
 
 
 def _ill(answer: Answer) -> str:
