@@ -14,7 +14,6 @@ nobody disturbed, set no checkpoint aside, and not go back: neither behind what 
 import argparse
 import collections
 import re
-import shutil
 import sys
 import time
 from collections.abc import Sequence
@@ -23,7 +22,7 @@ from typing import NamedTuple
 
 from purerl.core.errors import INTERRUPTED, SUCCESS
 from tests.faults import disk
-from tests.faults.commands import Worker, workplace
+from tests.faults.commands import Worker, fresh, workplace
 from tests.faults.verdicts import (
     SHORT,
     STOP_AT,
@@ -32,6 +31,8 @@ from tests.faults.verdicts import (
     command,
     complaint,
     kind_of,
+    last,
+    saved,
     undisturbed,
 )
 
@@ -97,10 +98,10 @@ def cut_all(words: list[str], every: int, models: tuple[str, ...]) -> Found:
     """Makes all cuts, and prints what came of them."""
     begin = time.monotonic()
     with workplace() as (folder, worker):
-        whole = undisturbed(worker, words, _new(folder / "whole"))
+        whole = undisturbed(worker, words, fresh(folder / "whole"))
         recorded = record(worker, words, folder)
         changes = recorded.changes
-        print(f"a run of {whole.lines[0][-1]['update']} updates, stopped and resumed: "
+        print(f"a run of {last(whole)} updates, stopped and resumed: "
               f"{len(changes)} changes of files", flush=True)  # fmt: skip
         found = try_all(worker, whole, recorded, folder, cuts_after(changes, every), models)
     _print_table(found, models)
@@ -123,14 +124,13 @@ def cuts_after(changes: list[disk.Change], every: int) -> set[int]:
 
 def record(worker: Worker, words: list[str], folder: Path) -> Recorded:
     """Makes a run that is stopped and resumed; RuntimeError if a change of its files was missed."""
-    place, log = _new(folder / "recorded"), folder / "own" / "record"
+    place, log = fresh(folder / "recorded"), folder / "own" / "record"
     promises = []
     for stop_at, code in ((STOP_AT, INTERRUPTED), (None, SUCCESS)):
         answer = worker.run(command(words, place), place, record=log, stop_at=stop_at)
         if answer.code != code:
             raise RuntimeError(f"The recorded run ended with {answer.code}:\n{answer.said}")
-        saved = max(int(path.name) for path in place.glob("runs/*/*/checkpoints/[0-9]*"))
-        promises.append((len(disk.read_record(log)), saved))
+        promises.append((len(disk.read_record(log)), saved(place)))
     changes, model = disk.read_record(log), disk.Disk(place)
     for change in changes:
         model.apply(change)
@@ -155,20 +155,20 @@ def try_all(
     for cut, model, tree in disk.trees(disk.Disk(root), changes, cuts, models):
         key = tuple(sorted(tree.items()))
         if key not in known:
-            known[key] = resume(worker, whole, tree, _new(folder / "cut"))
+            known[key] = resume(worker, whole, tree, fresh(folder / "cut"))
         ended = known[key]
         wrong = ended.wrong
-        promised = max((saved for after, saved in recorded.promises if after <= cut), default=0)
+        promised = max((update for after, update in recorded.promises if after <= cut), default=0)
         least = max(furthest[model], promised)
         if not wrong and ended.began < least:
             why = "the run had said" if promised == least else "an earlier cut left"
             wrong = f"it goes on after update {ended.began}, and {why} that {least} is saved"
         furthest[model] = least if ended.wrong else max(ended.began, least)
         if wrong:
-            last = str(changes[cut - 1]).replace(f"{root}/", "") if cut else "nothing"
+            change = str(changes[cut - 1]).replace(f"{root}/", "") if cut else "nothing"
             if kind_of(wrong) not in {kind_of(failure.wrong) for failure in failures}:
-                print(f"cut {cut} ({model}), after {last}: {wrong}\n{ended.said}", flush=True)
-            failures.append(Failure(cut, model, last, wrong, ended.said))
+                print(f"cut {cut} ({model}), after {change}: {wrong}\n{ended.said}", flush=True)
+            failures.append(Failure(cut, model, change, wrong, ended.said))
     return Found(len(cuts), len(known), failures)
 
 
@@ -177,12 +177,6 @@ def resume(worker: Worker, whole: Whole, tree: disk.Tree, place: Path) -> Ended:
     disk.write_tree(tree, place)
     answer = worker.run(command(whole.words, place), place)
     return Ended(complaint(answer, place, whole), began_at(answer, whole), answer.said)
-
-
-def _new(folder: Path) -> Path:
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    return folder
 
 
 def _print_table(found: Found, models: tuple[str, ...]) -> None:

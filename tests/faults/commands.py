@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import selectors
+import shutil
 import signal
 import subprocess
 import sys
@@ -30,6 +31,7 @@ class Answer(NamedTuple):
     fired: str = ""  # what the fault met, "" for nothing
     seconds: float = 0.0
     hung: bool = False
+    stuck: str = ""  # where a thread was left that would not let the process end
 
     @property
     def said(self) -> str:
@@ -97,10 +99,9 @@ class Worker:
         return Answer(None, "", f"{how}:\n{stacks}", "", seconds, hung)
 
     def _start(self) -> subprocess.Popen[str]:
-        flags = os.environ.get("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
         return subprocess.Popen(
             [sys.executable, "-m", "tests.faults.worker"],
-            env=shim.environment(self.library, XLA_FLAGS=flags),
+            env=shim.environment(self.library),
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors().open("w"),
             text=True,
         )  # fmt: skip
@@ -134,6 +135,13 @@ def workplace() -> Iterator[tuple[Path, Worker]]:
             yield folder, worker
         finally:
             worker.end()
+
+
+def fresh(folder: Path) -> Path:
+    """Makes an empty folder, whatever was there."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
 
 
 def _read_line(stream: Any, timeout: float) -> str | None:

@@ -76,14 +76,20 @@ class _Entry(NamedTuple):
 
 
 class Disk:
-    """The files below a root, that was empty and on the disk when recording began."""
+    """The files below a root; those that were there when recording began are all on the disk."""
 
-    def __init__(self, root: Path | str) -> None:
-        """Begins with an empty folder, whose path is `root`."""
+    def __init__(self, root: Path | str, begun: bool = False) -> None:
+        """Begins with an empty folder, whose path is `root`, or if `begun` with what is in it."""
         self.root = str(root)
         self.top = _Folder()
         self.nodes: dict[int, _File | _Folder] = {}
         self.pending: list[tuple[_Entry, ...]] = []  # changes of names that nobody promised yet
+        for path in sorted(Path(root).rglob("*")) if begun else ():
+            data = b"" if path.is_dir() else path.read_bytes()
+            node = _Folder() if path.is_dir() else _File(data, data)
+            self.nodes[path.stat().st_ino] = node
+            _set((self._entry(str(path), node),), promised=False)
+            _set((self._entry(str(path), node),), promised=True)
 
     def apply(self, change: Change) -> None:
         """Takes the next change."""

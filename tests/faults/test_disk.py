@@ -162,3 +162,14 @@ def test_a_tree_is_written_as_it_is_read(tmp_path):
     tree = {"d": None, "d/e": None, "d/e/a": b"x", "b": b""}
     write_tree(tree, tmp_path)
     assert read_tree(tmp_path) == tree
+
+
+def test_what_was_there_before_is_on_the_disk(tmp_path):
+    write_tree({"d": None, "d/a": b"old"}, tmp_path)
+    disk = Disk(tmp_path, begun=True)
+    assert all(disk.tree(model) == {"d": None, "d/a": b"old"} for model in MODELS)
+    inode = (tmp_path / "d" / "a").stat().st_ino
+    disk.apply(Change("write", inode, 3, "", "", b" new"))
+    disk.apply(Change("rename", 0, 0, f"{tmp_path}/d", f"{tmp_path}/e", b""))
+    assert disk.tree("strict") == {"d": None, "d/a": b"old"}
+    assert disk.tree("written") == {"e": None, "e/a": b"old new"}

@@ -24,16 +24,25 @@ class Whole(NamedTuple):
     lines: list[list[dict[str, Any]]]  # of each seed's metrics.jsonl, without the clock
 
 
-def command(words: list[str], place: Path) -> list[str]:
+def go_on(words: list[str], place: Path) -> list[str]:
     """Returns the words of the run in `place`/runs; --resume, if there is something to resume."""
-    runs = place / "runs"
-    resume = ["--resume"] if find(runs, NAME) else []
-    return [*words, "--runs", str(runs), "--name", NAME, *resume]
+    return [*words, *(["--resume"] if find(place / "runs", NAME) else [])]
 
 
-def undisturbed(worker: Worker, words: list[str], place: Path) -> Whole:
+def command(words: list[str], place: Path) -> list[str]:
+    """Returns the same words, and where the run is."""
+    return [*go_on(words, place), "--runs", str(place / "runs"), "--name", NAME]
+
+
+def undisturbed(
+    worker: Worker,
+    words: list[str],
+    place: Path,
+    record: Path | None = None,
+    trace: Path | None = None,
+) -> Whole:
     """Makes the run without disturbing it; RuntimeError if even that fails."""
-    answer = worker.run(command(words, place), place)
+    answer = worker.run(command(words, place), place, record, trace)
     if answer.code != SUCCESS:
         raise RuntimeError(f"The undisturbed run ended with {answer.code}:\n{answer.said}")
     return Whole(words, read_lines(place / "runs", NAME))
@@ -41,10 +50,8 @@ def undisturbed(worker: Worker, words: list[str], place: Path) -> Whole:
 
 def complaint(answer: Answer, place: Path, whole: Whole) -> str:
     """Returns what is wrong with a run that was taken to its end, in words; "" if nothing is."""
-    if answer.hung:
-        return "it hangs"
-    if "Traceback" in answer.said:
-        return f"a traceback: {_last_line(answer.err)}"
+    if ill := _ill(answer):
+        return ill
     if answer.code != SUCCESS:
         return f"exit code {answer.code}: {_last_line(answer.err)}"
     if aside := set_aside(place):
@@ -54,10 +61,8 @@ def complaint(answer: Answer, place: Path, whole: Whole) -> str:
 
 def untold(answer: Answer) -> str:
     """Returns what is wrong with how a command told its error, in words; "" if nothing is."""
-    if answer.hung:
-        return "it hangs"
-    if "Traceback" in answer.said or answer.code is None:
-        return f"a traceback: {_last_line(answer.err)}"
+    if ill := _ill(answer):
+        return ill
     if answer.code not in (FAILURE, USAGE, INTERRUPTED):
         return f"exit code {answer.code}"
     told = [line for line in answer.err.splitlines() if line.startswith("purerl: ")]
@@ -71,10 +76,16 @@ def set_aside(place: Path) -> list[str]:
     return sorted(path.name for path in place.glob("runs/*/*/checkpoints/damaged-*"))
 
 
+def saved(place: Path) -> int:
+    """Returns the newest update that the run has a checkpoint of, 0 if there is none."""
+    found = place.glob("runs/*/*/checkpoints/[0-9]*")
+    return max((int(path.name) for path in found if path.name.isdigit()), default=0)
+
+
 def began_at(answer: Answer, whole: Whole) -> int:
     """Returns the update after which a command went on, 0 if it began anew."""
     if "Already done" in answer.out:
-        return whole.lines[0][-1]["update"]
+        return last(whole)
     found = re.search(r"Resuming after update (\d+)", answer.out)
     return int(found[1]) if found else 0
 
@@ -84,6 +95,20 @@ def kind_of(text: str) -> str:
     text = re.sub(r"/[^\s:;,'\"]*/", "", text)
     text = re.sub(r"\b[0-9a-f]{12,}\b|\b\d+\b", "#", text)
     return text.split("\n")[0][:150]
+
+
+def last(whole: Whole) -> int:
+    """Returns the run's last update."""
+    return whole.lines[0][-1]["update"]
+
+
+def _ill(answer: Answer) -> str:
+    """Returns what no command may do, in words; "" if it did not."""
+    if answer.hung:
+        return "it hangs"
+    if "Traceback" in answer.said or answer.code is None:
+        return f"a traceback: {_last_line(answer.err)}"
+    return "it would hang at its end" if answer.stuck else ""
 
 
 def _difference(place: Path, whole: Whole) -> str:

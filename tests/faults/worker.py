@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -92,10 +92,27 @@ def carry_out(
             traceback.print_exc()
         fired = shim.disarm()
         gc.collect()  # what an exception held, a lock among it, as at the end of a process
-        for thread in set(threading.enumerate()) - before:
-            thread.join(0.2)  # what it prints belongs to this command
+        stuck = busy_after(set(threading.enumerate()) - before)
     answer = {"code": code, "out": out.getvalue(), "err": err.getvalue(), "fired": fired}
-    return answer | {"seconds": time.monotonic() - begin}
+    return answer | {"stuck": stuck, "seconds": time.monotonic() - begin}
+
+
+def busy_after(threads: Iterable[threading.Thread], seconds: float = 3.0) -> str:
+    """Returns where a thread is that would keep this process from ending, "" if there is none.
+
+    What they print while one waits for them belongs to the command.
+    """
+    end = time.monotonic() + seconds
+    for thread in threads:
+        while not thread.daemon and thread.is_alive():
+            frame = sys._current_frames().get(thread.ident or 0)
+            # A pool's thread without work ends with the process.
+            if frame is None or frame.f_code.co_name == "_worker":
+                break
+            if time.monotonic() > end:
+                return f"{thread.name}: {''.join(traceback.format_stack(frame))}"
+            time.sleep(0.01)
+    return ""
 
 
 def keep_programs() -> None:
