@@ -13,6 +13,7 @@ import jax
 
 from purerl import exact
 from purerl.core.records import Metrics, PyTree
+from purerl.devices import compile_cache
 
 # Up to so many cores, the evaluation is compiled when it is first needed, or the first update
 # would wait for it. With 16 cores all is compiled side by side: brax's ant came to its first
@@ -52,9 +53,8 @@ def set_up_jax(cache: bool) -> str:
         jax.config.update("jax_enable_compilation_cache", False)
         return "off"
     # JAX has read JAX_COMPILATION_CACHE_DIR by now, if it is set.
-    folder = jax.config.values["jax_compilation_cache_dir"] or str(cache_folder())
-    jax.config.update("jax_compilation_cache_dir", folder)
-    return folder
+    compile_cache.use(compile_cache.in_use() or str(cache_folder()))
+    return compile_cache.in_use()
 
 
 def cache_folder() -> Path:
