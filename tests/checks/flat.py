@@ -5,7 +5,7 @@ python -m tests.checks.flat [--updates 20000] [--checkpoints 500]
 Trains the tests' tiny experiment in a process of its own, and reads /proc four times a second.
 Prints the largest values in each quarter of the updates. Exit code 0 if the last quarter has no
 more descriptors or threads than the second one, and no more memory but for 2 MB and what
-tensorstore 0.1.86 never gives back: 0.25 KB of each `KvStore.Spec(...).to_json()`, which Orbax calls
+tensorstore 0.1.86 never gives back: 0.25 KB of each `KvStore.Spec(...).to_json()`. Orbax calls it
 two or three times for each leaf that it saves.
 """
 
