@@ -1,6 +1,5 @@
 """One process writes a run: it holds a lock on the folder, until it ends in whatever way."""
 
-import contextlib
 import errno
 import fcntl
 import os
@@ -53,11 +52,13 @@ class RunLock:
 
     def check(self) -> None:
         """Raises RunError if the folder is no longer where it was."""
-        mine = os.fstat(self.handles[0])
-        with contextlib.suppress(OSError):
-            there = os.stat(self.folder)
-            if (mine.st_dev, mine.st_ino) == (there.st_dev, there.st_ino):
+        try:
+            if os.path.samestat(os.fstat(self.handles[0]), os.stat(self.folder)):
                 return
+        except FileNotFoundError:
+            pass
+        except OSError:  # it may be there: what is written next will tell
+            return
         raise RunError(
             f"The run's folder {self.folder} has been moved or removed while it trained; nothing "
             "more can be saved there. Move it back, and go on with --resume."

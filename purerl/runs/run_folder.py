@@ -41,12 +41,12 @@ class RestoredRun(NamedTuple):
 
 @contextlib.contextmanager
 def refusals() -> Iterator[None]:
-    """Turns a disk's refusal to write what a run needs at its beginning into a UserError."""
+    """Turns a disk's refusal of what a run needs at its beginning into a UserError."""
     try:
         yield
     except OSError as error:
         where = error.filename or "The folder of the run"
-        raise UserError(f"{where} cannot be written: {error.strerror or error}.") from error
+        raise UserError(f"{where} cannot be read or written: {error.strerror or error}.") from error
 
 
 def check_new_or_resume(folders: Iterable[Path], resume: bool) -> None:

@@ -72,9 +72,10 @@ def execute(
       stop: tells whether a signal asked to stop.
     """
     chosen = next(iter(runs.values()))
+    check = run_folder.refusals()(run_folder.check_new_or_resume)
     with processes.fail_together(), ExitStack() as stack:
         processes.start(options.distributed)
-        alone(lambda: run_folder.check_new_or_resume(runs, options.resume))
+        alone(lambda: check(runs, options.resume))
         check_loggers(options)
         cache = compilation.set_up_jax(options.cache)
         with compilation.no_collection():
@@ -101,7 +102,7 @@ def execute(
             for folder in runs:
                 locks[folder] = RunLock(folder)
                 stack.callback(locks[folder].close)
-            run_folder.check_new_or_resume(runs, options.resume)  # another may have been here
+            check(runs, options.resume)  # another may have been here
             for folder, one in runs.items():
                 settings = run_folder.describe(source, one, schedule)
                 run_folder.begin_or_go_on(
@@ -137,6 +138,7 @@ def _tell_unordered(folders: Iterable[Path], exactness: dict[str, Any], places: 
         print(f"Not bit-exact: nothing fixes the order of the sum {place}", flush=True)
 
 
+@run_folder.refusals()
 def _shards_on_disk(folders: Iterable[Path]) -> int:
     """Returns how many shards a run was begun with, 0 if there is none yet."""
     begun = [folder for folder in folders if (folder / "config.json").exists()]
@@ -195,6 +197,7 @@ def _train_together(job: _Job, folders: list[Path], seeds: list[int]) -> None:
         say, saved = progress.say, list[checkpoint.Saved]()
         places = [folder / "checkpoints" for folder in folders]
 
+        @run_folder.refusals()
         def find() -> dict[str, Any]:
             facts = [read_json(folder / "manifest.json") for folder in folders]
             owners = list(map(identity.owners, facts))

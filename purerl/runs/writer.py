@@ -55,6 +55,7 @@ class RunWriter:
         self.last: Future[None] | None = None
         self.saving: Future[None] | None = None
         self.digest: str | None = None  # of the newest checkpoint written here
+        self.broken: BaseException | None = None  # what ended the writing
         self.failures = 0
         self.last_failure = ""  # why the newest checkpoint could not be saved; "": it could
 
@@ -73,13 +74,14 @@ class RunWriter:
           planned: whether the run would have saved here without being interrupted.
         """
         if self.saving is not None:
-            self.saving.result()  # two copies of the state in memory are enough
+            self.saving.exception()  # waits: two copies of the state in memory are enough
         self.saving = self._submit(self._save, record, leaves, meta, planned)
 
     def finish(self) -> None:
         """Waits until everything is on the disk; RunError if the last checkpoint is not."""
         if self.last is not None:
-            self.last.result()
+            self.last.exception()  # waits
+        self._raise_broken()
         self.close()
         if self.last_failure:
             raise RunError(
@@ -96,16 +98,28 @@ class RunWriter:
             logger.close()
 
     def _submit(self, job: Any, record: Record, *arguments: Any) -> Future[None]:
-        if self.last is not None and self.last.done():
-            self.last.result()  # raises what the job raised: a defect here, not a full disk
+        self._raise_broken()
         for logger in self.loggers:
             logger.log(dict(record))
-        self.last = self.worker.submit(job, dict(record), *arguments)
+        self.last = self.worker.submit(self._do, job, dict(record), *arguments)
         return self.last
 
+    def _do(self, job: Any, *arguments: Any) -> None:
+        """Does a job, unless one before it has failed: the order must hold."""
+        if self.broken is None:
+            try:
+                job(*arguments)
+            except BaseException as error:
+                self.broken = error
+
+    def _raise_broken(self) -> None:
+        """Raises what a job raised: no full disk, but a run that cannot go on, or a defect here."""
+        if self.broken is not None:
+            raise self.broken
+
     def _write(self, record: Record) -> None:
-        self.lock.check()
         self.metrics.add(record)
+        self.lock.check()
         try:
             self.metrics.write()
         except OSError as error:

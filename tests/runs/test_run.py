@@ -434,8 +434,8 @@ def test_a_read_only_folder_is_told_and_unharmed(whole, unprivileged, capsys):
     before = [f.read_bytes() for f in sorted(place.rglob("*")) if f.is_file()]
     lose_privileges()
     said = refused(capsys, start(place, "--resume"))
-    assert f"{folder(place)}/.lock cannot be written: Permission denied" in said
-    assert "cannot be written" in refused(capsys, start(place, "--name", "new"))
+    assert f"{folder(place)}/.lock cannot be read or written: Permission denied" in said
+    assert "cannot be read or written" in refused(capsys, start(place, "--name", "new"))
     assert [f.read_bytes() for f in sorted(place.rglob("*")) if f.is_file()] == before
 
 
@@ -533,7 +533,7 @@ def test_a_start_that_was_killed_half_way_can_be_made_again(tmp_path):
         (["--ppo.num-steps", "31"], "num_steps is 31, less than one update"),
         (["--ppo.num-minibatches", "3"], "does not divide"),
         (["--keep", "0"], "keep is 0"),
-        (["--runs", "/dev/null/runs"], "cannot be written"),
+        (["--runs", "/dev/null/runs"], "cannot be read or written"),
     ],
 )
 def test_a_mistake_is_one_line(tmp_path, capsys, words, message):
