@@ -22,12 +22,10 @@ from purerl import exact
 from purerl.core.env import Env
 from purerl.core.records import Array, Metrics, Network, PyTree, TrainState
 from purerl.devices.compilation import Compiling, shapes, start, unordered
-from purerl.devices.shards import AXIS, Shards, parts_of
-from purerl.devices.slices import count_slices, cut_in_slices
+from purerl.devices.shards import AXIS, Shards, improve
 from purerl.ppo import algorithm
 from purerl.ppo.algorithm import Experience
 from purerl.ppo.config import Config
-from purerl.ppo.learner import is_recurrent
 
 # Fields of TrainState that are [B, ...].
 PLACES = ("number", "env", "carry", "episode", "discounted_return")
@@ -153,16 +151,6 @@ def collect(
     """Moves one shard on; returns its places and, as one part [1, ...], what it saw."""
     state, experience = algorithm.collect(config, env, network, learned.replace(**places))
     return {name: getattr(state, name) for name in PLACES}, experience
-
-
-def improve(
-    config: Config, network: Network, shards: Shards, state: TrainState, experience: Experience
-) -> tuple[TrainState, Metrics]:
-    """Learns from all shards, which on a GPU are cut into slices; as `algorithm.improve`."""
-    recurrent, size = is_recurrent(experience.memory), config.num_envs // shards.number
-    number = count_slices(config, size, recurrent, jax.default_backend())
-    parts = parts_of(shards, number)
-    return algorithm.improve(config, network, state, cut_in_slices(number, experience), parts)
 
 
 def update(

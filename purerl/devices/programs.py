@@ -26,7 +26,7 @@ from purerl.devices.compilation import (
     unordered,
     when_needed,
 )
-from purerl.devices.shards import Shards
+from purerl.devices.shards import Shards, improve
 from purerl.ppo import algorithm
 from purerl.ppo.config import Config, Evaluation
 from purerl.ppo.evaluation import evaluate
@@ -134,7 +134,7 @@ def compile_update(
     ]
     halves: list[tuple[str, Callable]] = [
         ("collect", functools.partial(algorithm.collect, config, env, network)),
-        ("improve", functools.partial(multi_device.improve, config, network, Shards())),
+        ("improve", functools.partial(improve, config, network, Shards())),
     ]
     given, traced, started = (abstract,), [], []
     for name, function in halves if in_halves else whole:

@@ -19,10 +19,14 @@ import numpy as np
 from jax.extend import core
 
 from purerl.core.parts import WHOLE, Parts, add_in_order
-from purerl.core.records import Array, PyTree
-from purerl.devices.slices import SIDE_BY_SIDE
+from purerl.core.records import Array, Metrics, Network, PyTree, TrainState
+from purerl.devices.slices import SIDE_BY_SIDE, count_slices, cut_in_slices
 from purerl.exact import pallas_calls
 from purerl.exact.traces import has_loop
+from purerl.ppo import algorithm
+from purerl.ppo.algorithm import Experience
+from purerl.ppo.config import Config
+from purerl.ppo.learner import is_recurrent
 
 AXIS = "devices"
 
@@ -137,3 +141,13 @@ def gather(shards: Shards, parts: PyTree) -> PyTree:
         for i, column in zip(places, columns, strict=True):
             gathered[i] = column.reshape(-1, *leaves[i].shape[1:])
     return jax.tree.unflatten(structure, gathered)
+
+
+def improve(
+    config: Config, network: Network, shards: Shards, state: TrainState, experience: Experience
+) -> tuple[TrainState, Metrics]:
+    """Learns from all shards, which on a GPU are cut into slices; as `algorithm.improve`."""
+    recurrent, size = is_recurrent(experience.memory), config.num_envs // shards.number
+    number = count_slices(config, size, recurrent, jax.default_backend())
+    parts = parts_of(shards, number)
+    return algorithm.improve(config, network, state, cut_in_slices(number, experience), parts)

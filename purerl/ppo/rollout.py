@@ -154,6 +154,7 @@ def rollout(
       sums over the episodes that ended, name -> [B]; the value of the last observation [B].
     """
     reset_keys = per_environment(derive(state.key, Purpose.RESET, state.update), state.number)
+    # One start for an update, its number 0; without the fold all digests would be others.
     fresh = jax.vmap(lambda key: env.reset(jax.random.fold_in(key, 0)))(reset_keys)
     action_key = derive(state.key, Purpose.ACTION, state.update)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from purerl.core.parts import WHOLE, add_in_order, as_one_part
-from purerl.devices import multi_device, programs
+from purerl.devices import programs, shards
 from purerl.devices.shards import Shards, parts_of
 from purerl.devices.slices import count_slices, cut_in_slices
 from purerl.ppo import algorithm, batches, learner, running_moments
@@ -151,10 +151,10 @@ def test_on_a_gpu_an_update_is_two_programs_that_make_the_same(recurrent, monkey
 def test_on_a_gpu_minibatches_are_cut_in_slices(monkeypatch):
     asked = []
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(multi_device, "count_slices", lambda *x: asked.append(x) or 2)
+    monkeypatch.setattr(shards, "count_slices", lambda *x: asked.append(x) or 2)
     env, network, state = setup()
     after, experience = algorithm.collect(CONFIG, env, network, state)
-    improve = partial(multi_device.improve, CONFIG, network, Shards())
+    improve = partial(shards.improve, CONFIG, network, Shards())
     _, metrics = improve(after, experience)
     assert asked == [(CONFIG, 6, False, "gpu")]
     assert metrics["skipped_minibatches"] == 0 and metrics["gradient_norm"] > 0
