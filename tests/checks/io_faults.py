@@ -109,18 +109,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--sample", type=int, default=0, help="faults, of all kinds; 0: all")
     parser.add_argument("--seed", type=int, default=0, help="of the sample")
     parser.add_argument("--only", choices=names, help="in which situation")
+    parser.add_argument("--part", default="0/1", help="I/N: part I of N, for N processes")
     parser.add_argument("words", nargs="*", help="-- EXPERIMENT [--option value ...]")
     options = parser.parse_args(arguments)
     situations = [one for one in SITUATIONS if options.only in (None, one.name)]
+    first, parts = map(int, options.part.split("/"))
+    part = slice(first, None, parts)
     found = fault_all(
-        options.words or SHORT, situations, options.every, options.sample, options.seed
+        options.words or SHORT, situations, options.every, options.sample, options.seed, part
     )
     return 1 if found.failures else 0
 
 
 def fault_all(
-    words: list[str], situations: Iterable[Situation], every: int, sample: int = 0, seed: int = 0
-) -> Found:
+    words: list[str], situations: Iterable[Situation], every: int, sample: int = 0, seed: int = 0,
+    part: slice = slice(None),
+) -> Found:  # fmt: skip
     """Makes the faults, and prints what came of them."""
     begin = time.monotonic()
     with workplace() as (folder, worker):
@@ -134,7 +138,7 @@ def fault_all(
             found = cases_of(situation, calls)
             print(f"{situation.name}: {len(calls)} calls, {len(found)} faults", flush=True)
             cases += found
-        cases = choose(cases, every, sample, seed)
+        cases = choose(cases, every, sample, seed)[part]
         found = try_all(worker, whole, cases, folder, before)
     _print_table(found)
     print(f"{len(cases)} faults, {found.met} met a call, {found.told} told as errors: "

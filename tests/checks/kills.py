@@ -166,7 +166,7 @@ def phase_of(runs: Path, name: str) -> str:
         return "compiling"
     unfinished = [path.name for folder in folders for path in folder.glob("checkpoints/*")]
     unfinished += [path.name for folder in folders for path in folder.glob("checkpoints/.*")]
-    if any("tmp" in name for name in unfinished):
+    if any(name.startswith(".writing") for name in unfinished):
         return "while saving"
     if any(name.startswith(".deleting") for name in unfinished):
         return "while deleting a checkpoint"
