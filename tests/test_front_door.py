@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import os
 import re
 import subprocess
 import sys
@@ -62,6 +63,15 @@ def test_importing_it_is_quick_and_starts_no_jax():
     said = fresh(code + "print(t, [m for m in ('jax', 'mujoco', 'tyro') if m in sys.modules])")
     seconds, _, heavy = said.partition(" ")
     assert float(seconds) < 0.3 and heavy.strip() == "[]"
+
+
+def test_a_folder_of_its_name_does_not_hide_it(tmp_path):
+    """Such as the clone itself, for who works in the folder that holds it."""
+    (tmp_path / "purerl").mkdir()
+    elsewhere = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    words = [sys.executable, "-c", "import purerl; print(purerl.__version__)"]
+    done = subprocess.run(words, cwd=tmp_path, env=elsewhere, capture_output=True, text=True)
+    assert done.stdout == f"{purerl.__version__}\n", done.stderr
 
 
 def test_lists_and_help_pages_start_no_jax():
