@@ -13,6 +13,7 @@ from purerl.core.errors import UserError
 from purerl.runs.command_errors import leave
 from purerl.runs.command_line import carry_out
 from purerl.runs.options import PlayOptions
+from purerl.runs.output import show
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ def command(options: Options) -> None:
             file.write_text(json.dumps(result, indent=2) + "\n")
     except OSError as error:
         raise UserError(f"{file} cannot be written: {error.strerror}.") from error
-    print("\n".join(describe(result)))
+    show(*describe(result))
 
 
 def describe(result: dict[str, Any]) -> list[str]:

@@ -29,6 +29,7 @@ from purerl.core.errors import UserError
 from purerl.runs.command_errors import leave
 from purerl.runs.command_line import carry_out
 from purerl.runs.options import PlayOptions
+from purerl.runs.output import show
 
 
 @dataclass(frozen=True)
@@ -62,9 +63,7 @@ def command(options: Options) -> None:
     arrays = record(run.restored.setup, run.state, options.seed, options.episodes)
     with options.out.open("wb") as file:  # by its name, numpy would give it another
         np.savez(file, **arrays)  # type: ignore[arg-type]
-    for name, array in arrays.items():
-        print(f"{name:32} {array.dtype} {list(array.shape)}")
-    print(options.out)
+    show(*(f"{name:32} {x.dtype} {list(x.shape)}" for name, x in arrays.items()), str(options.out))
 
 
 if __name__ == "__main__":

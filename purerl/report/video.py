@@ -44,7 +44,7 @@ def make_video(
     if not isinstance(physics, Physics):
         raise UserError(
             f"The environment {type(run.env).__name__} cannot be drawn: it has no `physics` of the "
-            "type purerl.physics.interface.Physics."
+            "type purerl.Physics."
         )
     try:
         renderer = Renderer(physics.model, *size, camera)

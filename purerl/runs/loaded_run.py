@@ -57,10 +57,11 @@ class Run:
     def restored(self) -> "run_folder.RestoredRun":
         """The experiment rebuilt, and the checkpoint."""
         from purerl.devices.compilation import set_up_jax
+        from purerl.runs.output import show
         from purerl.runs.run_folder import restore
 
         set_up_jax(cache=True)
-        return restore(self.folder, self.checkpoint, print, self.engine)
+        return restore(self.folder, self.checkpoint, show, self.engine)
 
     @functools.cached_property
     def policy(self) -> "Policy":

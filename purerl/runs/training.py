@@ -15,6 +15,7 @@ from typing import Any
 
 from purerl.core.errors import UserError
 from purerl.exact import xla_flags
+from purerl.runs import output
 from purerl.runs.command_line import from_settings
 from purerl.runs.experiment import Experiment, Source, find_source
 from purerl.runs.loaded_run import Run
@@ -92,7 +93,7 @@ def set_xla_flags_in_time() -> None:
     Then the manifest says that the run is not bit-exact. On a CPU they change nothing.
     """
     if _runs_on_gpu() and xla_flags.how_chosen("gpu") == "by timing":
-        print(
+        output.say(
             "JAX has begun on the GPU with kernels chosen by timing, so this run is not bit-exact: "
             "call purerl.exact.set_xla_flags() before JAX's first computation."
         )
@@ -126,8 +127,7 @@ def stop_signals(end: Callable[[int], Any]) -> Iterator[Callable[[], bool]]:
             return
         received.append(number)
         name = signal.Signals(number).name
-        said = f"\n{name}: finishing this chunk, then saving. Once more to stop at once."
-        print(said, file=sys.stderr, flush=True)
+        output.warn(f"\n{name}: finishing this chunk, then saving. Once more to stop at once.")
 
     old = {}
     if threading.current_thread() is threading.main_thread():
