@@ -1,13 +1,13 @@
 """A run read back from its folder: its policy, its metrics, its evaluation."""
 
 import functools
-import json
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from purerl.core.errors import UserError, one_line
+from purerl.core.errors import UserError
+from purerl.runs.files import check_is_run, read_metrics
 
 if TYPE_CHECKING:
     from purerl.runs import run_folder
@@ -33,10 +33,7 @@ def load(folder: Path | str, checkpoint: str = "latest", engine: str = "") -> "R
     2
     """
     folder = Path(folder)
-    if not (folder / "config.json").is_file():
-        from purerl.runs.run_folder import check_is_run
-
-        check_is_run(folder)
+    check_is_run(folder)
     return Run(folder, str(checkpoint), engine)
 
 
@@ -134,14 +131,3 @@ class Run:
             "episodes": episodes,
             "metrics": {name: summarize(values) for name, values in sorted(found.items())},
         }
-
-
-def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Reads whole lines of metrics.jsonl: a run that is being written may end in half a line."""
-    if not path.exists():
-        return []
-    texts = path.read_text().split("\n")[:-1]
-    try:
-        return [json.loads(text) for text in texts]
-    except ValueError as error:
-        raise UserError(f"{path} has a line that is no JSON: {one_line(error)}") from error

@@ -143,7 +143,7 @@ def _tell_unordered(folders: Iterable[Path], exactness: dict[str, Any], places: 
 def _shards_on_disk(folders: Iterable[Path]) -> int:
     """Returns how many shards a run was begun with, 0 if there is none yet."""
     begun = [folder for folder in folders if (folder / "config.json").exists()]
-    return read_json(begun[0] / "manifest.json")["num_shards"] if begun else 0
+    return manifest.read(begun[0])["num_shards"] if begun else 0
 
 
 def _choose_shards(config: Config, abstract: PyTree, options: Options, begun_with: int) -> Shards:
@@ -200,7 +200,7 @@ def _train_together(job: _Job, folders: list[Path], seeds: list[int]) -> None:
 
         @run_folder.refusals()
         def find() -> dict[str, Any]:
-            facts = [read_json(folder / "manifest.json") for folder in folders]
+            facts = list(map(manifest.read, folders))
             owners = list(map(identity.owners, facts))
             saved.extend(checkpoint.newest(places, job.abstract, say, owners=owners))
             if not saved:

@@ -18,6 +18,7 @@ from purerl.exact import xla_flags
 from purerl.runs import output
 from purerl.runs.command_line import from_settings
 from purerl.runs.experiment import Experiment, Source, find_source
+from purerl.runs.files import check_name
 from purerl.runs.loaded_run import Run
 from purerl.runs.options import Options
 
@@ -76,6 +77,9 @@ def train_runs(
     """
     from purerl.runs.session import execute
 
+    check_name("The experiment's name", source.name)
+    if options.name is not None:
+        check_name("name", options.name)
     place, runs = options.runs / source.name, {}
     for seed in range(chosen.seed, chosen.seed + options.num_seeds):
         name = options.name or f"seed{seed}"
