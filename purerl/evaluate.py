@@ -40,7 +40,7 @@ def command(options: Options) -> None:
     file = options.json
     if file is not None and not file.absolute().parent.is_dir():
         raise UserError(f"{file} cannot be written: there is no such folder.")
-    run = load(options.run, options.checkpoint, options.engine)
+    run = load(options.run, options.checkpoint, options.engine, options.trust)
     result = run.evaluate(options.episodes, options.seed, options.stochastic)
     try:
         if file is not None:

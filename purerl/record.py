@@ -59,7 +59,7 @@ def command(options: Options) -> None:
     place = options.out.absolute().parent
     if not os.access(place, os.W_OK):
         raise UserError(f"{options.out} cannot be written: is {place} a folder of yours?")
-    run = load(options.run, options.checkpoint, options.engine)
+    run = load(options.run, options.checkpoint, options.engine, options.trust)
     arrays = record(run.restored.setup, run.state, options.seed, options.episodes)
     with options.out.open("wb") as file:  # by its name, numpy would give it another
         np.savez(file, **arrays)  # type: ignore[arg-type]

@@ -53,7 +53,7 @@ def make(options: Options) -> list[str]:
     from purerl.report.video import make_video
     from purerl.runs.loaded_run import load
 
-    run = load(options.run, options.checkpoint, options.engine)
+    run = load(options.run, options.checkpoint, options.engine, options.trust)
     about = (options.camera, options.episodes, options.seconds, size, options.seed)
     path, lines = make_video(run, *about)
     return [*lines, str(path)]

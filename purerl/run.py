@@ -74,7 +74,7 @@ def _command(arguments: Sequence[str]) -> None:
         from purerl.devices.processes import is_first
 
         if is_first():
-            _attempt(_show_policy, render.Options(folders[0]))
+            _attempt(_show_policy, render.Options(folders[0], trust=True))
 
 
 def _show_policy(options: Any) -> None:

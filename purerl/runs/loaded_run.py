@@ -14,13 +14,19 @@ if TYPE_CHECKING:
     from purerl.runs.policy import Policy
 
 
-def load(folder: Path | str, checkpoint: str = "latest", engine: str = "") -> "Run":
+def load(
+    folder: Path | str, checkpoint: str = "latest", engine: str = "", trust: bool = False
+) -> "Run":
     """Reads a run back from its folder alone; nothing in it is changed.
+
+    The run's experiment.py is executed when something but `metrics()` is first asked for: if it is
+    known on this machine, as of a run trained here, or with `trust` (docs/trust.md).
 
     Args:
       folder: the run's folder, such as "runs/ant_run/seed1".
       checkpoint: "latest", "best" (highest evaluation return), or an update's number.
       engine: a physics engine, where it should not be the run's own.
+      trust: the code in the folder may be executed, though this machine does not know it.
 
     Raises:
       UserError: the folder holds no run.
@@ -34,7 +40,7 @@ def load(folder: Path | str, checkpoint: str = "latest", engine: str = "") -> "R
     """
     folder = Path(folder)
     check_is_run(folder)
-    return Run(folder, str(checkpoint), engine)
+    return Run(folder, str(checkpoint), engine, trust)
 
 
 def _saved_as(name: str, doc: str) -> property:
@@ -49,6 +55,7 @@ class Run:
     folder: Path
     checkpoint: str = "latest"
     engine: str = ""  # "": the run's own
+    trust: bool = False
 
     @functools.cached_property
     def restored(self) -> "run_folder.RestoredRun":
@@ -58,7 +65,7 @@ class Run:
         from purerl.runs.run_folder import restore
 
         set_up_jax(cache=True)
-        return restore(self.folder, self.checkpoint, show, self.engine)
+        return restore(self.folder, self.checkpoint, show, self.engine, self.trust)
 
     @functools.cached_property
     def policy(self) -> "Policy":

@@ -28,6 +28,7 @@ from purerl.runs.files import (
 from purerl.runs.lock import LOCK
 from purerl.runs.loggers import Say
 from purerl.runs.source_hashes import module_file, source_hashes
+from purerl.runs.trust import load_copy
 
 OURS = {LOCK, "config.json", "manifest.json", "experiment.py", "metrics.jsonl", "checkpoints"}
 MANY = 9  # edited files, which a refusal to resume then counts and does not list
@@ -207,7 +208,9 @@ def note_checkpoint(folder: Path) -> None:
 # --- reading back ---
 
 
-def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> RestoredRun:
+def restore(
+    folder: Path | str, update: str, say: Say, engine: str = "", trust: bool = False
+) -> RestoredRun:
     """Rebuilds a run from its folder alone, to see what its policy does; changes nothing in it.
 
     The state comes without `env`, `episode` and `optimizer`: a policy needs none of them, and on
@@ -218,14 +221,13 @@ def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> Rest
       update: "latest", "best" (highest evaluation return), or an update's number.
       say: told of damaged checkpoints, and of what is no longer as it was when the run began.
       engine: instead of the run's own, where that one is not at hand.
+      trust: whether its code may be executed though it is not known; see `trust.load_copy`.
     """
     folder = Path(folder)
     check_is_run(folder)
     config = read_json(folder / "config.json", experiment=str, settings=dict)
     begun = manifest.read(folder)
-    original = Path(begun["experiment_file"])
-    origin = original if original.is_file() else None
-    source = experiment.load(folder / "experiment.py", config["experiment"], origin=origin)
+    source = load_copy(folder, config["experiment"], Path(begun["experiment_file"]), trust)
     settings = _fill(config["settings"], experiment.to_json(source.experiment), say)
     chosen = experiment.from_json(
         source.experiment, settings | ({"engine": engine} if engine else {})

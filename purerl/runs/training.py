@@ -21,6 +21,7 @@ from purerl.runs.experiment import Experiment, Source, find_source
 from purerl.runs.files import check_name
 from purerl.runs.loaded_run import Run
 from purerl.runs.options import Options
+from purerl.runs.trust import remember
 
 
 def train(
@@ -60,7 +61,7 @@ def train(
     chosen, how = from_settings(source, settings or {}, options)
     if how.video:
         raise UserError("video is an option of the command; call `python -m purerl.render RUN`.")
-    runs = [Run(folder) for folder in train_runs(source, chosen, how, _interrupt)]
+    runs = [Run(folder, trust=True) for folder in train_runs(source, chosen, how, _interrupt)]
     return runs[0] if how.num_seeds == 1 else runs
 
 
@@ -86,6 +87,7 @@ def train_runs(
         if options.num_seeds > 1 and options.name:
             name += f"-seed{seed}"
         runs[place / name] = dataclasses.replace(chosen, seed=seed)
+    remember(source.text, source.path)
     with stop_signals(end) as stop:
         execute(source, runs, options, stop)
     return list(runs)
