@@ -8,6 +8,7 @@ from pathlib import Path
 from purerl.core.errors import USAGE, UserError, unknown_name
 from purerl.runs.command_errors import leave, tell
 from purerl.runs.experiment import summary
+from purerl.runs.output import show
 
 COMMANDS = ("run", "evaluate", "render", "record", "compare")
 
@@ -19,9 +20,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return importlib.import_module(f"purerl.{name}").main(rest)
     if name not in ("", "-h", "--help"):
         return tell(UserError(unknown_name("command", name, COMMANDS)))
-    for command in COMMANDS:
-        print(f"{command:9} {summary(Path(__file__).with_name(f'{command}.py'))}")
-    print("\nOptions of a command: python -m purerl COMMAND --help")
+    files = [Path(__file__).with_name(f"{command}.py") for command in COMMANDS]
+    show(*(f"{file.stem:9} {summary(file)}" for file in files))
+    show("", "Options of a command: python -m purerl COMMAND --help")
     return 0 if name else USAGE
 
 

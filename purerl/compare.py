@@ -17,6 +17,7 @@ import tyro
 from purerl.core.errors import FAILURE, SUCCESS, UserError
 from purerl.runs.command_errors import leave
 from purerl.runs.command_line import carry_out
+from purerl.runs.output import show
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ def command(options: Options) -> int:
     if not options.runs:
         raise UserError("Give the runs to compare: python -m purerl.compare RUN RUN ...")
     result, curves = comparison.compare(options.runs, options.metric, options.group_by)
-    print("\n".join(comparison.describe(result)))
+    show(*comparison.describe(result))
     if options.out is not None:
         comparison.write(options.out, result, curves)
     broken = any(pair["same"] is False and pair["promised"] for pair in result["pairs"])

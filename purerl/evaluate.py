@@ -13,6 +13,7 @@ from purerl.core.errors import UserError
 from purerl.runs.command_errors import leave
 from purerl.runs.command_line import carry_out
 from purerl.runs.options import PlayOptions
+from purerl.runs.output import show
 
 
 @dataclass(frozen=True)
@@ -39,14 +40,14 @@ def command(options: Options) -> None:
     file = options.json
     if file is not None and not file.absolute().parent.is_dir():
         raise UserError(f"{file} cannot be written: there is no such folder.")
-    run = load(options.run, options.checkpoint, options.engine)
+    run = load(options.run, options.checkpoint, options.engine, options.trust)
     result = run.evaluate(options.episodes, options.seed, options.stochastic)
     try:
         if file is not None:
             file.write_text(json.dumps(result, indent=2) + "\n")
     except OSError as error:
         raise UserError(f"{file} cannot be written: {error.strerror}.") from error
-    print("\n".join(describe(result)))
+    show(*describe(result))
 
 
 def describe(result: dict[str, Any]) -> list[str]:

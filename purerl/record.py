@@ -29,6 +29,7 @@ from purerl.core.errors import UserError
 from purerl.runs.command_errors import leave
 from purerl.runs.command_line import carry_out
 from purerl.runs.options import PlayOptions
+from purerl.runs.output import show
 
 
 @dataclass(frozen=True)
@@ -58,13 +59,11 @@ def command(options: Options) -> None:
     place = options.out.absolute().parent
     if not os.access(place, os.W_OK):
         raise UserError(f"{options.out} cannot be written: is {place} a folder of yours?")
-    run = load(options.run, options.checkpoint, options.engine)
+    run = load(options.run, options.checkpoint, options.engine, options.trust)
     arrays = record(run.restored.setup, run.state, options.seed, options.episodes)
     with options.out.open("wb") as file:  # by its name, numpy would give it another
         np.savez(file, **arrays)  # type: ignore[arg-type]
-    for name, array in arrays.items():
-        print(f"{name:32} {array.dtype} {list(array.shape)}")
-    print(options.out)
+    show(*(f"{name:32} {x.dtype} {list(x.shape)}" for name, x in arrays.items()), str(options.out))
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from purerl.core.errors import UserError
 from purerl.runs.command_errors import leave
 from purerl.runs.command_line import carry_out
 from purerl.runs.options import PlayOptions
+from purerl.runs.output import show
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def command(options: Options) -> None:
-    """Checks the options, makes the video, and prints where it is."""
+    """Makes the video, and prints where it is."""
+    show(*make(options))
+
+
+def make(options: Options) -> list[str]:
+    """Checks the options and makes the video; returns lines about it, the last one its path."""
     from purerl.report.opengl import open_gl
 
     size = _parse_size(options.size)
@@ -47,10 +53,10 @@ def command(options: Options) -> None:
     from purerl.report.video import make_video
     from purerl.runs.loaded_run import load
 
-    run = load(options.run, options.checkpoint, options.engine)
+    run = load(options.run, options.checkpoint, options.engine, options.trust)
     about = (options.camera, options.episodes, options.seconds, size, options.seed)
     path, lines = make_video(run, *about)
-    print(*lines, path, sep="\n")
+    return [*lines, str(path)]
 
 
 def _parse_size(size: str) -> tuple[int, int]:

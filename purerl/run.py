@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from purerl.core.errors import USAGE, RunError, StoppedError, UserError, one_line
-from purerl.runs import experiment
+from purerl.runs import experiment, output
 from purerl.runs.command_errors import leave, tell
 
 
@@ -27,8 +27,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(_help_page())
+        output.show(*_help_page())
         return 0 if arguments else USAGE
+    code = 0
     try:
         _command(arguments)
     except (UserError, RunError, StoppedError) as error:
@@ -36,18 +37,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(error, StoppedError):
             more = [] if "--resume" in arguments else ["--resume"]
             again = shlex.join(["python", "-m", "purerl.run", *arguments, *more])
-            print(f"Go on with: {again}", file=sys.stderr)
-        return code
-    return 0
+            output.warn(f"Go on with: {again}")
+    output.settle(sys.stdout)
+    return code
 
 
-def _help_page() -> str:
+def _help_page() -> list[str]:
     """Returns the page of `python -m purerl.run --help`, without importing JAX."""
-    lines = [str(__doc__), "Experiments:"]
+    lines = [*str(__doc__).split("\n"), "Experiments:"]
     named = experiment.available()
     width = max(map(len, named), default=0)
     lines += [f"  {name:{width}}  {experiment.summary(path)}" for name, path in named.items()]
-    return "\n".join(lines if named else [*lines, "  none in experiments/"])
+    return lines if named else [*lines, "  none in experiments/"]
 
 
 def _command(arguments: Sequence[str]) -> None:
@@ -66,22 +67,32 @@ def _command(arguments: Sequence[str]) -> None:
     source = experiment.find_source(arguments[0])
     prog = f"python -m purerl.run {arguments[0]}"
     chosen, options = from_command_line(source, arguments[1:], prog)
-    if options.video:  # before mujoco is imported, which looks for OpenGL itself
-        _attempt(choose_gl)
+    # Before mujoco is imported, which looks for OpenGL itself.
+    video = options.video and _attempt(choose_gl)
     folders = training.train_runs(source, chosen, options, os._exit)
-    if options.video:
+    if video:
         from purerl.devices.processes import is_first
 
         if is_first():
-            _attempt(render.command, render.Options(folders[0]))
+            _attempt(_show_policy, render.Options(folders[0], trust=True))
 
 
-def _attempt(part: Callable[..., Any], *arguments: Any) -> None:
+def _show_policy(options: Any) -> None:
+    """Makes a video; training has ended, and nothing that cannot be printed is a failure of it."""
+    from purerl import render
+
+    for line in render.make(options):
+        output.say(line)
+
+
+def _attempt(part: Callable[..., Any], *arguments: Any) -> bool:
     """Calls a part of making a video; a failure is one line, and changes no exit code."""
     try:
         part(*arguments)
     except Exception as error:
-        print(f"purerl: There is no video: {one_line(error)}", file=sys.stderr)
+        output.warn(f"purerl: There is no video: {one_line(error)}")
+        return False
+    return True
 
 
 if __name__ == "__main__":

@@ -1,6 +1,8 @@
 """What all tests share."""
 
+import atexit
 import os
+import shutil
 import tempfile
 
 # Reported cure for hangs of XLA's CPU pool on large vmapped programs, and bits that do not depend
@@ -11,6 +13,10 @@ os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
 COMPILED = os.path.join(tempfile.gettempdir(), "purerl-test-compilations")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", COMPILED)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
+# The list of known experiments; not that of who tests.
+os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="purerl-test-state-")
+atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
 
 import hypothesis  # noqa: E402
 import jax  # noqa: E402

@@ -11,6 +11,7 @@ from purerl.report.bootstrap import LEAST_RUNS
 from purerl.report.seed_statistics import Curve
 from purerl.runs import manifest
 from purerl.runs.files import write_json
+from purerl.runs.output import printable
 
 # A table's columns: what stands above, and the key of the value.
 GROUPS = [
@@ -170,7 +171,7 @@ def _curve_rows(curves: Iterable[Curve]) -> Iterator[dict[str, Any]]:
 
 def _write_csv(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> None:
     """Writes rows; what is None or missing is an empty cell."""
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", errors="backslashreplace") as file:
         writer = csv.DictWriter(file, columns, extrasaction="ignore")
         writer.writeheader()
         writer.writerows(rows)
@@ -181,6 +182,7 @@ def _plot(path: Path, curves: Iterable[Curve], metric: str) -> None:
     import matplotlib  # most of a second
 
     matplotlib.use("Agg")
+    matplotlib.rcParams["text.parse_math"] = False  # labels have settings in them, any text
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(figsize=(8, 5), layout="constrained")
@@ -191,9 +193,11 @@ def _plot(path: Path, curves: Iterable[Curve], metric: str) -> None:
         iqm, low, high = curve.band
         if low is not None and high is not None:
             axes.fill_between(curve.steps, low, high, color=color, alpha=0.2, linewidth=0)
-        label = f"{curve.label} (n = {len(curve.runs)})"
+        label = printable(f"{curve.label} (n = {len(curve.runs)})")
         axes.plot(curve.steps, iqm, color=color, linewidth=2, label=label)
-    axes.set(xlabel="control steps", ylabel=metric, title="Interquartile mean, 95% intervals")
+    axes.set(
+        xlabel="control steps", ylabel=printable(metric), title="Interquartile mean, 95% intervals"
+    )
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
     figure.savefig(path, dpi=120)

@@ -1,17 +1,24 @@
 """Reads runs back from their folders: settings, metrics, and how far each run came."""
 
 import glob
-import math
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from purerl.core.errors import UserError, one_line
+from purerl.core.errors import UserError
 from purerl.ppo.config import Config
-from purerl.runs.files import read_json, runs_in
-from purerl.runs.loaded_run import read_metrics
+from purerl.runs.files import (
+    check_is_run,
+    check_object,
+    read_bytes,
+    read_json,
+    read_metrics,
+    runs_in,
+)
 from purerl.runs.loggers import MAX_SKIPPED_IN_A_ROW
 
+NUMBER = int | float | None
 NOT_LEARNING = ("seed", "evaluation")  # settings that tell runs of one configuration apart
 
 
@@ -48,7 +55,7 @@ class RunRecord(NamedTuple):
     def curve(self, metric: str) -> dict[int, float]:
         """Returns steps -> value wherever the metric was measured and finite."""
         found = {line["steps"]: line.get(metric) for line in self.lines}
-        return {steps: float(v) for steps, v in found.items() if v is not None and math.isfinite(v)}
+        return {steps: float(v) for steps, v in found.items() if v is not None and _is_finite(v)}
 
 
 def find_runs(arguments: Iterable[Path]) -> list[Path]:
@@ -69,24 +76,37 @@ def find_runs(arguments: Iterable[Path]) -> list[Path]:
 
 
 def read(path: Path) -> RunRecord:
-    """Reads one run's folder."""
-    config = read_json(path / "config.json")
-    try:
-        settings = config["settings"]
-        learning = {k: v for k, v in settings.items() if k not in NOT_LEARNING}
-        return RunRecord(
-            path=path,
-            seed=settings["seed"],
-            settings=_flatten({"experiment": config["experiment"]} | learning),
-            manifest=read_json(path / "manifest.json"),
-            source=(path / "experiment.py").read_bytes(),
-            lines=read_metrics(path / "metrics.jsonl"),
-            planned=_planned_updates(settings["ppo"]),
-        )
-    except (KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"{path / 'config.json'} is not a run's: {one_line(error)}.") from error
-    except OSError as error:
-        raise UserError(f"{error.filename} cannot be read: {error.strerror}.") from error
+    """Reads one run's folder; executes nothing of it."""
+    check_is_run(path)
+    config = read_json(path / "config.json", experiment=str, settings=dict)
+    settings = check_object(str(path / "config.json"), config["settings"], seed=int, ppo=dict)
+    experiment = {"experiment": config["experiment"]}
+    learning = {k: v for k, v in settings.items() if k not in NOT_LEARNING}
+    file = path / "metrics.jsonl"
+    return RunRecord(
+        path=path,
+        seed=settings["seed"],
+        settings=experiment | _flatten(learning) | experiment,
+        manifest=read_json(path / "manifest.json"),
+        source=read_bytes(path / "experiment.py"),
+        lines=[_check_line(f"{file}, line {i}", x) for i, x in enumerate(read_metrics(file), 1)],
+        planned=_planned_updates(settings["ppo"]),
+    )
+
+
+def _check_line(where: str, line: dict[str, Any]) -> dict[str, Any]:
+    """Returns a line of metrics.jsonl; UserError unless it holds numbers, and maybe a digest."""
+    kinds = dict.fromkeys(line, NUMBER) | {"update": int, "steps": int}
+    check_object(where, line, **(kinds | {"digest": str} if "digest" in line else kinds))
+    for name in ("update", "steps"):
+        if not 0 <= line[name] <= sys.maxsize:
+            raise UserError(f"{where}: {name} is {line[name]}; it must be from 0 to {sys.maxsize}.")
+    return line
+
+
+def _is_finite(value: float) -> bool:
+    """Tells whether a number is one that a float holds: JSON's integers have no end."""
+    return abs(value) <= sys.float_info.max
 
 
 def _flatten(value: Any, path: str = "") -> dict[str, Any]:
@@ -100,5 +120,5 @@ def _flatten(value: Any, path: str = "") -> dict[str, Any]:
 def _planned_updates(ppo: dict[str, Any]) -> int | None:
     try:
         return Config(**ppo).num_updates
-    except (TypeError, ValueError):  # the settings of another version
+    except (TypeError, ValueError, ArithmeticError):  # the settings of another version
         return None

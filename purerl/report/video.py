@@ -14,6 +14,7 @@ from purerl.core.keys import Purpose, derive
 from purerl.physics.interface import Physics
 from purerl.report.episode_pictures import Recording, episode_pictures, frame_stride, record
 from purerl.report.renderer import Renderer
+from purerl.runs.files import check_inside
 from purerl.runs.loaded_run import Run
 
 SHEET = 4  # rows and columns of the contact sheet
@@ -44,7 +45,7 @@ def make_video(
     if not isinstance(physics, Physics):
         raise UserError(
             f"The environment {type(run.env).__name__} cannot be drawn: it has no `physics` of the "
-            "type purerl.physics.interface.Physics."
+            "type purerl.Physics."
         )
     try:
         renderer = Renderer(physics.model, *size, camera)
@@ -81,8 +82,11 @@ def _write_files(
 ) -> None:
     """Writes a video of `number` frames and, beside it, its contact sheet; each whole or not."""
     drafts = {kind: path.with_name(f".{path.stem}{kind}") for kind in (".png", ".mp4")}
+    check_inside(path.parent.parent, path.parent)
     try:
         path.parent.mkdir(exist_ok=True)
+        for draft in drafts.values():  # it may be a link, to be written through
+            draft.unlink(missing_ok=True)
         _write_video(drafts[".mp4"], frames, number, size, fps).save(drafts[".png"])
         for kind, draft in drafts.items():
             draft.replace(path.with_suffix(kind))

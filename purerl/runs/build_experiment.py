@@ -104,14 +104,14 @@ def blame(env: Env) -> Iterator[None]:
         try:
             check_shapes(env)
         except EnvError as broken:
-            what = f"{one_line(broken)}{_own_line(broken.__cause__)}"
+            what = f"{one_line(broken)}{own_line(broken.__cause__)}"
             raise UserError(f"The environment {type(env).__name__}: {what}") from error
         except Exception:
             pass  # no rule, but an error in its code, of which the first one tells more
         raise
 
 
-def _own_line(error: BaseException | None) -> str:
+def own_line(error: BaseException | None) -> str:
     """Returns " (FILE, line N)": the last line of the user's own code on the way to an error.
 
     Code of this library and of installed packages is not the user's. "" if no line is.

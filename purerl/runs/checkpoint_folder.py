@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import UserError, one_line
-from purerl.runs.files import hash_file, sync
+from purerl.runs.files import check_plain, hash_file, read_small, sync
 
 META = "meta.json"
 KINDS = {
@@ -57,13 +57,14 @@ def load_meta(path: Path) -> dict[str, Any]:
       UserError: it cannot be read, or was written by another program or version.
     """
     with reading(path):
-        text = (path / META).read_bytes()
+        text = read_small(path / META)
     try:
         meta = json.loads(text)
         expected = meta.pop("meta_sha256")
+        found = hash_meta(meta)
     except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
         raise DamagedError(f"{META} is cut or overwritten ({type(error).__name__})") from error
-    if hash_meta(meta) != expected:
+    if found != expected:
         raise DamagedError(f"{META} is not what was written (sha256 differs)")
     _check_kinds(path / META, meta)
     return meta
@@ -72,7 +73,7 @@ def load_meta(path: Path) -> dict[str, Any]:
 def _check_kinds(file: Path, meta: dict[str, Any]) -> None:
     """Raises UserError if metadata are not laid out as this version of purerl writes them."""
     wrong = [name for name, kind in KINDS.items() if not isinstance(meta.get(name), kind)]
-    if not wrong and any(leaf.keys() != LEAF for leaf in meta["leaves"].values()):
+    if not wrong and not all(isinstance(x, dict) and {*x} == LEAF for x in meta["leaves"].values()):
         wrong = ["leaves"]
     if wrong:
         raise UserError(
@@ -93,6 +94,7 @@ def verify(path: Path) -> dict[str, Any]:
       DamagedError: a file is not what was written.
       UserError: a file cannot be read, or the checkpoint is of another update than its name says.
     """
+    check_plain(path)
     meta = load_meta(path)
     if path_of(path.parent, meta["update"]) != path and path.name.isdigit():
         raise UserError(

@@ -1,17 +1,17 @@
 """How a command ends: its exit code, and its error as one line."""
 
-import os
 import signal
 import sys
 from collections.abc import Callable
 from typing import NoReturn
 
 from purerl.core.errors import RunError, StoppedError, UserError
+from purerl.runs import output
 
 
 def tell(error: UserError | RunError | StoppedError) -> int:
     """Prints an error as one line and returns its exit code."""
-    print(f"purerl: {error}", file=sys.stderr)
+    output.warn(f"purerl: {error}")
     return error.exit_code
 
 
@@ -21,14 +21,17 @@ def leave(command: Callable[[], int]) -> NoReturn:
     An error is told in one line. Two ends are silent, with the exit code of a program that the
     signal ended: Ctrl-C before a run has begun (SIGINT), a reader that left (`| head`, SIGPIPE).
     """
+    output.hold_standard_files()
     try:
-        code = command()
-        sys.stdout.flush()
+        try:
+            code = command()
+        finally:
+            output.show()  # what waits, of a help page too
     except (UserError, RunError) as error:
         code = tell(error)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more
         code = 128 + signal.SIGPIPE
     except KeyboardInterrupt:
         code = 128 + signal.SIGINT
+    output.settle(sys.stderr)
     sys.exit(code)

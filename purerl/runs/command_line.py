@@ -12,7 +12,7 @@ from typing import Any
 import tyro
 
 from purerl.core.errors import SUCCESS, RunError, UserError
-from purerl.runs import experiment
+from purerl.runs import experiment, output
 from purerl.runs.command_errors import tell
 from purerl.runs.experiment import Experiment, Source
 from purerl.runs.options import Options
@@ -102,7 +102,7 @@ def parse(
     said = io.StringIO()
     extra = {} if default is None else {"default": default}
     try:
-        with contextlib.redirect_stderr(said):
+        with output.answering(), contextlib.redirect_stderr(said):
             return tyro.cli(kind, args=list(arguments), prog=prog, config=config, **extra)
     except SystemExit as error:
         if not error.code:

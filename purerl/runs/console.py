@@ -10,6 +10,7 @@ from typing import Any
 import jax
 
 from purerl.core.records import PyTree
+from purerl.runs import output
 from purerl.runs.build_experiment import Setup
 from purerl.runs.loggers import Record
 from purerl.runs.loop import Plan
@@ -77,7 +78,7 @@ class _Lines:
         self.shown = 0.0  # when, by the monotonic clock [s]
 
     def say(self, line: str) -> None:
-        print(line, flush=True)
+        output.say(line)
 
     def show(self, record: Record, seconds_left: float, steps_per_second: float) -> None:
         """Prints a line for a chunk, unless one has just been printed."""
@@ -96,6 +97,7 @@ class _Bar:
         self.task = bar.add_task("", total=updates)
 
     def say(self, line: str) -> None:
+        line = output.printable(line)
         self.bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def show(self, record: Record, seconds_left: float, steps_per_second: float) -> None:
@@ -121,11 +123,15 @@ def progress(updates: int) -> Iterator[_Lines | _Bar]:
 
     It has `say(line)`, and `show(record, seconds_left, steps_per_second)` for each chunk.
     """
-    if not sys.stdout.isatty():
+    file: Any = output.Guarded(sys.stdout)
+    if not file.isatty():
         yield _Lines(updates)
         return
+    from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
     columns = (BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"))
-    with Progress(*columns) as bar:
+    # Else it takes what is said to standard error, wherever that leads.
+    both = output.Guarded(sys.stderr).isatty()
+    with Progress(*columns, console=Console(file=file), redirect_stderr=both) as bar:
         yield _Bar(updates, bar)

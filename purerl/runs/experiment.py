@@ -8,7 +8,9 @@ import contextlib
 import dataclasses
 import enum
 import importlib.util
+import inspect
 import re
+import reprlib
 import sys
 import traceback
 from collections.abc import Callable, Iterator
@@ -20,6 +22,8 @@ import tyro
 
 from purerl.core.errors import UserError, one_line, unknown_name
 from purerl.ppo.config import Config, Evaluation
+from purerl.runs.files import read_bytes
+from purerl.runs.kinds import fits, hints
 from purerl.runs.options import Engine
 
 
@@ -56,6 +60,7 @@ class Source(NamedTuple):
     experiment: Experiment
     name: str  # names the folder under runs/
     path: Path
+    text: bytes = b""  # of the file, as it was executed
 
 
 # --- finding ---
@@ -120,39 +125,46 @@ def find_source(name: str) -> Source:
     raise UserError(unknown_name("experiment", name, named, places))
 
 
-def load(path: Path, name: str = "", copy_of: Path | None = None) -> Source:
+def load(
+    path: Path, name: str = "", text: bytes | None = None, origin: Path | None = None
+) -> Source:
     """Loads the experiment that a Python file defines as `experiment = Experiment(...)`.
+
+    What is executed is the file's text and nothing else: Python's own loader would rather take
+    compiled code that it finds in `__pycache__`.
 
     Args:
       path: the file.
       name: the experiment's, if that is not the file's.
-      copy_of: the file that it is a copy of. Where that still exists it is its `__file__`: what
-        the experiment reads stands beside it.
+      text: what the file holds, where it has been read.
+      origin: the file that it is a copy of. That is its `__file__`: what the experiment reads
+        stands beside it.
     """
+    text = read_bytes(path) if text is None else text
     path = path.resolve()
-    place = copy_of if copy_of is not None and copy_of.is_file() else path
+    place = origin or path
     module_name = _module_name(path)
     spec = importlib.util.spec_from_file_location(module_name, path)
-    assert spec is not None and spec.loader is not None  # it is an existing .py file
+    assert spec is not None  # it is a .py file
     module = importlib.util.module_from_spec(spec)
     sys.modules[module_name] = module  # dataclasses and help texts look their module up
     module.__file__ = str(place)
     with _mistakes(str(path), place):
-        nodes = list(ast.walk(ast.parse(path.read_text(), str(path))))
+        nodes = list(ast.walk(ast.parse(text, str(path))))
     if any(isinstance(node, ast.ImportFrom) and node.level for node in nodes):
         raise UserError(
             f"{path} imports relatively (from . import ...), and a run keeps a copy of the file "
             "that has to work alone: import by the full name."
         )
     with _mistakes(str(path), place):
-        spec.loader.exec_module(module)
+        exec(compile(text, str(path), "exec", dont_inherit=True), module.__dict__)
     found = getattr(module, "experiment", None)
     if not isinstance(found, Experiment):
         raise UserError(f"{path} defines no `experiment = Experiment(...)` (it is {found!r}).")
     for field in ("env", "network", "ppo", "evaluation"):
         if not _has_settings(value := getattr(found, field)):
             raise UserError(f"{path}: {field} is {value!r}; it must be a frozen dataclass's value.")
-    return Source(found, name or path.stem, path)
+    return Source(found, name or path.stem, path, text)
 
 
 def _module_name(path: Path) -> str:
@@ -233,13 +245,23 @@ def from_json(template: Any, values: Any, path: str = "") -> Any:
       UserError: a field is missing or unknown: the code is not the one that wrote the values.
     """
     if _has_settings(template):
-        known = settings(template)
+        known, kinds = settings(template), hints(type(template))
         _check_names(list(known), values, path)
-        read = {n: from_json(value, values[n], _join(path, n)) for n, value in known.items()}
+        for name, value in known.items():
+            kind, given = kinds.get(name, Any), values[name]
+            if not fits(kind, given) and given != (like := to_json(value)):
+                must = f"{inspect.formatannotation(kind)}, such as {like!r}"
+                where = _join(path, name)
+                raise UserError(
+                    f"config.json: {where} is {reprlib.repr(given)}; it must be {must}."
+                )
         try:
+            read = {n: from_json(value, values[n], _join(path, n)) for n, value in known.items()}
             return dataclasses.replace(template, **read)
-        except ValueError as error:
-            raise UserError(f"{path or 'experiment'}: {error}") from error
+        except UserError:
+            raise
+        except Exception as error:  # a rule of the dataclass, or of its author
+            raise UserError(f"config.json: {path or 'experiment'}: {one_line(error)}") from error
     if isinstance(template, enum.Enum):
         return type(template)[values]
     if isinstance(template, Path):

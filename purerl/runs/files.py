@@ -1,24 +1,133 @@
-"""The files of runs: written whole or not at all, and which folders are runs. No JAX.
+"""The files of runs: read with care, written whole or not at all; which folders are runs. No JAX.
 
 What a function here has written stays written when the power fails: a file's content by its fsync,
 its name by that of its folder.
+
+A folder may come from a stranger. What stands where a run's file should be shall neither hang its
+reader (a pipe, a device) nor fill the memory, and what it says is checked where it is read.
 """
 
+import contextlib
+import errno
 import hashlib
+import io
 import json
 import os
+import reprlib
+import stat
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from types import NoneType
+from typing import Any, get_args
 
 from purerl.core.errors import UserError, one_line
 
+LARGEST = 16 << 20  # [bytes] of a JSON file
+LARGEST_METRICS = 1 << 30  # [bytes] of metrics.jsonl
+LONGEST_NAME = 200  # [bytes]; most file systems take 255, and a seed's number may follow
+DEEPEST = 50  # objects and lists in each other; Python's own recursion ends at some hundreds
+KINDS = {
+    dict: "an object {name: value}", list: "a list", str: "a string", int: "a whole number",
+    float: "a number", bool: "true or false", NoneType: "null",
+}  # fmt: skip
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Reads a JSON file; UserError if it is missing or broken."""
+
+# --- reading ---
+
+
+@contextlib.contextmanager
+def open_file(path: Path) -> Iterator[io.BufferedReader]:
+    """Opens a file to be read; OSError for a pipe, a device, a folder."""
     try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read: {one_line(error)}") from error
+        # Without O_NONBLOCK a pipe would wait for a writer.
+        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    except ValueError as error:  # a name with a null byte
+        raise OSError(errno.EINVAL, str(error), str(path)) from error
+    try:
+        if not stat.S_ISREG(os.fstat(handle).st_mode):
+            raise OSError(errno.EINVAL, "it is no regular file", str(path))
+        with open(handle, "rb", closefd=False) as file:
+            yield file
+    finally:
+        os.close(handle)
+
+
+def read_small(path: Path, largest: int = LARGEST) -> bytes:
+    """Reads a file; OSError unless it is a regular one of at most `largest` bytes."""
+    with open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > largest:
+            raise OSError(errno.EFBIG, f"it has {size:,} bytes, of at most {largest:,}", str(path))
+        return file.read(size)
+
+
+def read_bytes(path: Path, largest: int = LARGEST) -> bytes:
+    """Reads a file as `read_small`; UserError if it cannot."""
+    try:
+        return read_small(path, largest)
+    except (OSError, MemoryError) as error:
+        raise UserError(f"{path} cannot be read: {_reason(error)}.") from error
+
+
+def read_json(path: Path, **kinds: Any) -> dict[str, Any]:
+    """Reads a JSON file that holds an object.
+
+    Args:
+      path: the file.
+      kinds: the keys that are needed, and the type of each value: `settings=dict`,
+        `model=str | None`.
+
+    Raises:
+      UserError: the file is missing or broken, or lacks a key, or its value is of another type.
+    """
+    return check_object(str(path), _parse(str(path), read_bytes(path)), **kinds)
+
+
+def check_object(where: str, value: Any, /, **kinds: Any) -> dict[str, Any]:
+    """Returns `value` if it is a JSON object with these keys; `where` is for the message."""
+    if not isinstance(value, dict):
+        raise UserError(f"{where} holds {reprlib.repr(value)}; it must hold {KINDS[dict]}.")
+    for name, kind in kinds.items():
+        valid = get_args(kind) or (kind,)
+        if name not in value:
+            raise UserError(f"{where} lacks {name}, which a run's has.")
+        if type(value[name]) not in valid:  # a bool is no int
+            must = " or ".join(KINDS[one] for one in valid)
+            raise UserError(f"{where}: {name} is {reprlib.repr(value[name])}; it must be {must}.")
+    return value
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Reads whole lines of metrics.jsonl: a run that is being written may end in half a line."""
+    if not os.path.lexists(path):
+        return []
+    texts = read_bytes(path, LARGEST_METRICS).split(b"\n")[:-1]
+    return [
+        check_object(where := f"{path}, line {number}", _parse(where, text))
+        for number, text in enumerate(texts, 1)
+    ]
+
+
+def _parse(where: str, text: bytes) -> Any:
+    """Returns JSON as a value; UserError if it is none, or nested too deeply to be a run's."""
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError, MemoryError) as error:
+        raise UserError(f"{where} is no JSON: {one_line(error)}.") from error
+    level = [value]
+    for _ in range(DEEPEST):
+        nested = [x for x in level if isinstance(x, dict | list)]
+        level = [x for one in nested for x in (one.values() if isinstance(one, dict) else one)]
+        if not level:
+            return value
+    raise UserError(f"{where} is nested more than {DEEPEST} deep, which no file of a run is.")
+
+
+def _reason(error: BaseException) -> str:
+    return getattr(error, "strerror", None) or one_line(error)
+
+
+# --- writing ---
 
 
 def write_json(path: Path, value: dict[str, Any]) -> None:
@@ -75,7 +184,8 @@ def hash_files(folder: Path) -> dict[str, str]:
 
 def hash_file(path: Path) -> str:
     """Returns a file's sha256."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    with open_file(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def draft_of(path: Path) -> Path:
@@ -83,10 +193,77 @@ def draft_of(path: Path) -> Path:
     return path.with_name(f".{path.name}.draft")
 
 
+# --- which folders are runs, and what may stand in them ---
+
+
+def check_is_run(folder: Path) -> None:
+    """Raises UserError unless a folder holds a run; the message lists the runs inside of it."""
+    found = runs_in(folder)
+    if found != [folder]:
+        runs = f" Runs in it: {', '.join(map(str, found))}." if found else ""
+        what = "no run: it has no config.json" if folder.is_dir() else "no folder"
+        raise UserError(f"{folder} is {what}.{runs}")
+
+
 def runs_in(place: Path) -> list[Path]:
     """Returns the run that a folder is, or the runs one or two levels below it; [] for none."""
-    for pattern in ("config.json", "*/config.json", "*/*/config.json"):
-        runs = sorted(file.parent for file in place.glob(pattern))
-        if runs:
-            return runs
-    return []
+    try:
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            (place / "config.json").stat()
+            return [place]
+        below = (sorted(place.glob(f"{stars}/config.json")) for stars in ("*", "*/*"))
+        return [file.parent for file in next(filter(None, below), [])]
+    except (OSError, ValueError) as error:
+        raise UserError(f"{place} cannot be read: {_reason(error)}.") from error
+
+
+def check_name(what: str, name: str) -> None:
+    """Raises UserError unless a name is that of one folder, which can be printed and typed."""
+    fits = name.isprintable() and len(os.fsencode(name)) <= LONGEST_NAME
+    if not fits or "/" in name or name in ("", ".", "..") or name.startswith("-"):
+        raise UserError(
+            f"{what} is {reprlib.repr(name)}; it must be the name of one folder: at most "
+            f"{LONGEST_NAME} bytes, all printable, without / and not '', '.', '..' or -..."
+        )
+
+
+def check_inside(folder: Path, path: Path) -> None:
+    """Raises UserError where a link in a run's folder leads `path` out of it.
+
+    The folder itself may be a link, and anything above it.
+    """
+    if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder)):
+        raise UserError(f"{path} is a link that leaves the run's folder: put a copy there instead.")
+
+
+def check_memory(folder: Path, size: int) -> None:
+    """Raises UserError if this machine has no room to read a state of `size` bytes."""
+    room = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if 2 * size > room:  # a reader holds it twice
+        raise UserError(
+            f"The state of {folder} takes {size / 1e9:,.0f} GB, by its config.json; this machine "
+            f"has {room / 1e9:,.0f} GB of memory."
+        )
+
+
+def check_no_links(folder: Path) -> None:
+    """Raises UserError if a run that goes on would write through a link: it writes in its folder.
+
+    A folder in it, such as `checkpoints`, may be a link: that is how a large one is kept elsewhere.
+    """
+    for entry in os.scandir(folder) if folder.is_dir() else ():
+        if not (entry.is_file(follow_symlinks=False) or entry.is_dir()):
+            raise UserError(f"{entry.path} is no file of the run, but a link or worse: remove it.")
+
+
+def check_plain(folder: Path) -> None:
+    """Raises UserError if a folder holds, at any depth, what is neither a file nor a folder.
+
+    Who opens a pipe waits for ever. A file may be a link to one elsewhere; a folder may not.
+    """
+    for place, folders, files in os.walk(folder):
+        for path in (Path(place, name) for name in (*folders, *files)):
+            with contextlib.suppress(FileNotFoundError):  # the run may be going on
+                plain = stat.S_ISREG(path.stat().st_mode) or path.is_dir() and not path.is_symlink()
+                if not plain:
+                    raise UserError(f"{path} is neither a file nor a folder.")

@@ -1,26 +1,32 @@
 """A run read back from its folder: its policy, its metrics, its evaluation."""
 
 import functools
-import json
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from purerl.core.errors import UserError, one_line
+from purerl.core.errors import UserError
+from purerl.runs.files import check_is_run, read_metrics
 
 if TYPE_CHECKING:
     from purerl.runs import run_folder
     from purerl.runs.policy import Policy
 
 
-def load(folder: Path | str, checkpoint: str = "latest", engine: str = "") -> "Run":
+def load(
+    folder: Path | str, checkpoint: str = "latest", engine: str = "", trust: bool = False
+) -> "Run":
     """Reads a run back from its folder alone; nothing in it is changed.
+
+    The run's experiment.py is executed when something but `metrics()` is first asked for: if it is
+    known on this machine, as of a run trained here, or with `trust` (docs/trust.md).
 
     Args:
       folder: the run's folder, such as "runs/ant_run/seed1".
       checkpoint: "latest", "best" (highest evaluation return), or an update's number.
       engine: a physics engine, where it should not be the run's own.
+      trust: the code in the folder may be executed, though this machine does not know it.
 
     Raises:
       UserError: the folder holds no run.
@@ -33,11 +39,8 @@ def load(folder: Path | str, checkpoint: str = "latest", engine: str = "") -> "R
     2
     """
     folder = Path(folder)
-    if not (folder / "config.json").is_file():
-        from purerl.runs.run_folder import check_is_run
-
-        check_is_run(folder)
-    return Run(folder, str(checkpoint), engine)
+    check_is_run(folder)
+    return Run(folder, str(checkpoint), engine, trust)
 
 
 def _saved_as(name: str, doc: str) -> property:
@@ -52,15 +55,17 @@ class Run:
     folder: Path
     checkpoint: str = "latest"
     engine: str = ""  # "": the run's own
+    trust: bool = False
 
     @functools.cached_property
     def restored(self) -> "run_folder.RestoredRun":
         """The experiment rebuilt, and the checkpoint."""
         from purerl.devices.compilation import set_up_jax
+        from purerl.runs.output import show
         from purerl.runs.run_folder import restore
 
         set_up_jax(cache=True)
-        return restore(self.folder, self.checkpoint, print, self.engine)
+        return restore(self.folder, self.checkpoint, show, self.engine, self.trust)
 
     @functools.cached_property
     def policy(self) -> "Policy":
@@ -133,14 +138,3 @@ class Run:
             "episodes": episodes,
             "metrics": {name: summarize(values) for name, values in sorted(found.items())},
         }
-
-
-def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Reads whole lines of metrics.jsonl: a run that is being written may end in half a line."""
-    if not path.exists():
-        return []
-    texts = path.read_text().split("\n")[:-1]
-    try:
-        return [json.loads(text) for text in texts]
-    except ValueError as error:
-        raise UserError(f"{path} has a line that is no JSON: {one_line(error)}") from error

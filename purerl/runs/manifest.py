@@ -11,6 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from purerl.runs.files import check_object, read_json
 from purerl.runs.source_hashes import source_hashes
 
 PACKAGES = ["jax", "jaxlib", "mujoco", "mujoco-mjx", "dm-control", "flax", "optax", "numpy"]
@@ -21,6 +22,21 @@ INFORMATIVE |= {"fingerprint", "had_checkpoint"}  # identity.py, run_folder.py
 # What these follow from is compared itself.
 INFORMATIVE |= {"experiment_file", "bit_exact", "inexact_because"}
 FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE", "JAX_PLATFORMS", "JAX_ENABLE_X64")
+
+
+def read(folder: Path) -> dict[str, Any]:
+    """Reads a run's manifest.json; UserError unless it has what is needed to use the run."""
+    path = folder / "manifest.json"
+    facts = read_json(
+        path, run_id=str, name=str, fingerprint=str, experiment_file=str, engine=str, source=dict,
+        num_shards=int, model=str | None,
+    )  # fmt: skip
+    where = f"{path}: allowed_changes"
+    changes = {"allowed_changes": [], **facts}
+    for change in check_object(str(path), changes, allowed_changes=list)["allowed_changes"]:
+        check_object(where, change, fingerprint=str, after_update=int)
+        check_object(where, change.get("of", {}))
+    return facts
 
 
 def collect(

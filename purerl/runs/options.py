@@ -21,6 +21,8 @@ class PlayOptions:
     """Seed of the episodes; never meets a seed of training."""
     engine: Literal["", Engine] = ""
     """Physics engine, where it should not be the run's own."""
+    trust: bool = False
+    """Execute the run's experiment.py though this machine does not know it: read it first."""
 
 
 @dataclass(frozen=True)

@@ -6,23 +6,29 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from purerl.core.errors import UserError
+import jax
+
+from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.records import PyTree, TrainState
 from purerl.devices.programs import abstract_state
 from purerl.runs import checkpoint, checkpoint_folder, experiment, identity, manifest
-from purerl.runs.build_experiment import Setup, build, physics_hash
+from purerl.runs.build_experiment import Setup, build, own_line, physics_hash
 from purerl.runs.experiment import Experiment, Source
 from purerl.runs.files import (
+    check_is_run,
+    check_memory,
+    check_no_links,
     draft_of,
     make_folder,
+    read_bytes,
     read_json,
-    runs_in,
     write_file,
     write_json,
 )
 from purerl.runs.lock import LOCK
 from purerl.runs.loggers import Say
 from purerl.runs.source_hashes import module_file, source_hashes
+from purerl.runs.trust import load_copy
 
 OURS = {LOCK, "config.json", "manifest.json", "experiment.py", "metrics.jsonl", "checkpoints"}
 MANY = 9  # edited files, which a refusal to resume then counts and does not list
@@ -60,6 +66,7 @@ def check_new_or_resume(folders: Iterable[Path], resume: bool) -> None:
     if resume and not any(folder.exists() for folder in folders):
         raise UserError(f"There is no run {folders[0]} to resume; leave out --resume to start it.")
     for folder in folders:
+        check_no_links(folder)
         is_run = (folder / "config.json").exists()
         if is_run and not resume:
             raise UserError(f"The run {folder} exists; use --resume to go on, or another --name.")
@@ -109,10 +116,10 @@ def begin_or_go_on(
     if not (folder / "config.json").exists():
         _write(folder, source, settings, _identity(folder) | facts)
         return
-    old = read_json(folder / "manifest.json")
+    old = manifest.read(folder)
     found = manifest.differences(read_json(folder / "config.json"), settings)
     found += manifest.differences(old, facts)
-    if (folder / "experiment.py").read_bytes() != source.path.read_bytes():
+    if read_bytes(folder / "experiment.py") != source.text:
         found.append(f"experiment.py: {source.path} has been edited")
     found += edited(folder)
     if found and not allow_changes:
@@ -129,7 +136,7 @@ def begin_or_go_on(
 
 def _write(folder: Path, source: Source, settings: dict[str, Any], facts: dict[str, Any]) -> None:
     """Writes the three files that describe a run; config.json last, it makes it a run."""
-    code = source.path.read_bytes()
+    code = source.text
     facts = facts | {"fingerprint": identity.fingerprint(settings, facts, code)}
     make_folder(folder / "checkpoints")
     write_file(folder / "experiment.py", code)
@@ -140,7 +147,7 @@ def _write(folder: Path, source: Source, settings: dict[str, Any], facts: dict[s
 def edited(folder: Path) -> list[str]:
     """Returns a line if the three files that describe a run are not what it wrote."""
     facts, config = read_json(folder / "manifest.json"), read_json(folder / "config.json")
-    code = (folder / "experiment.py").read_bytes()
+    code = read_bytes(folder / "experiment.py")
     if facts.get("fingerprint") == identity.fingerprint(config, facts, code):
         return []
     return ["fingerprint: config.json, manifest.json or experiment.py is not what the run wrote"]
@@ -201,7 +208,9 @@ def note_checkpoint(folder: Path) -> None:
 # --- reading back ---
 
 
-def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> RestoredRun:
+def restore(
+    folder: Path | str, update: str, say: Say, engine: str = "", trust: bool = False
+) -> RestoredRun:
     """Rebuilds a run from its folder alone, to see what its policy does; changes nothing in it.
 
     The state comes without `env`, `episode` and `optimizer`: a policy needs none of them, and on
@@ -212,34 +221,32 @@ def restore(folder: Path | str, update: str, say: Say, engine: str = "") -> Rest
       update: "latest", "best" (highest evaluation return), or an update's number.
       say: told of damaged checkpoints, and of what is no longer as it was when the run began.
       engine: instead of the run's own, where that one is not at hand.
+      trust: whether its code may be executed though it is not known; see `trust.load_copy`.
     """
     folder = Path(folder)
     check_is_run(folder)
-    config = read_json(folder / "config.json")
-    begun = read_json(folder / "manifest.json")
-    original = Path(begun["experiment_file"])
-    source = experiment.load(folder / "experiment.py", config["experiment"], original)
+    config = read_json(folder / "config.json", experiment=str, settings=dict)
+    begun = manifest.read(folder)
+    source = load_copy(folder, config["experiment"], Path(begun["experiment_file"]), trust)
     settings = _fill(config["settings"], experiment.to_json(source.experiment), say)
     chosen = experiment.from_json(
         source.experiment, settings | ({"engine": engine} if engine else {})
     )
-    setup = build(chosen)
+    try:
+        setup = build(chosen)
+    except (UserError, RunError):
+        raise
+    except Exception as error:  # of code that trained: it, or its settings, is another since
+        what = f"{one_line(error)}{own_line(error)}"
+        raise UserError(f"{folder} cannot be built with its config.json: {what}") from error
     for what in _changed_since(begun, source, setup):
         say(f"{what} is not that of the run any more.")
     for what in edited(folder):
         say(f"Edited since the run: {what}.")
     abstract = abstract_state(*setup[:3])
     abstract = abstract.replace(env=None, episode=None, optimizer=None)
+    check_memory(folder, sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(abstract)))
     return RestoredRun(chosen, setup, _choose(folder / "checkpoints", update, abstract, say, begun))
-
-
-def check_is_run(folder: Path) -> None:
-    """Raises UserError unless a folder holds a run; the message lists the runs inside of it."""
-    if not (folder / "config.json").is_file():
-        inside = ", ".join(map(str, runs_in(folder)))
-        runs = f" Runs in it: {inside}." if inside else ""
-        what = "no run: it has no config.json" if folder.is_dir() else "no folder"
-        raise UserError(f"{folder} is {what}.{runs}")
 
 
 def _changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[str]:

@@ -8,7 +8,6 @@ an update that all of them have on the disk.
 
 import functools
 import hashlib
-import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -36,8 +35,10 @@ from purerl.runs import (
     identity,
     loop,
     manifest,
+    output,
     run_folder,
 )
+from purerl.runs.command_errors import tell
 from purerl.runs.experiment import Experiment, Source
 from purerl.runs.files import read_json, write_json
 from purerl.runs.lock import RunLock
@@ -108,8 +109,8 @@ def execute(
                 run_folder.begin_or_go_on(
                     folder, source, settings, facts, abstract, options.allow_changes
                 )
-            lines = console.describe_plan(plan, setup, abstract, facts, list(runs), cache)
-            print("\n".join(lines), flush=True)
+            for line in console.describe_plan(plan, setup, abstract, facts, list(runs), cache):
+                output.say(line)
             return not all(checkpoint_folder.updates(folder / "checkpoints") for folder in runs)
 
         fresh = alone(prepare)
@@ -135,14 +136,14 @@ def _tell_unordered(folders: Iterable[Path], exactness: dict[str, Any], places: 
         path = folder / "manifest.json"
         write_json(path, read_json(path) | exactness)
     for place in places:
-        print(f"Not bit-exact: nothing fixes the order of the sum {place}", flush=True)
+        output.say(f"Not bit-exact: nothing fixes the order of the sum {place}")
 
 
 @run_folder.refusals()
 def _shards_on_disk(folders: Iterable[Path]) -> int:
     """Returns how many shards a run was begun with, 0 if there is none yet."""
     begun = [folder for folder in folders if (folder / "config.json").exists()]
-    return read_json(begun[0] / "manifest.json")["num_shards"] if begun else 0
+    return manifest.read(begun[0])["num_shards"] if begun else 0
 
 
 def _choose_shards(config: Config, abstract: PyTree, options: Options, begun_with: int) -> Shards:
@@ -182,7 +183,7 @@ def _train_all(runs: dict[Path, Experiment], job: _Job) -> None:
         except RunError as error:  # the seeds after it can still be trained
             failed.append(str(error))
             if len(groups) > 1:  # they may take long, or be stopped
-                print(f"purerl: {error}", file=sys.stderr, flush=True)
+                tell(error)
     if failed:
         raise RunError(" ".join(failed))
 
@@ -199,7 +200,7 @@ def _train_together(job: _Job, folders: list[Path], seeds: list[int]) -> None:
 
         @run_folder.refusals()
         def find() -> dict[str, Any]:
-            facts = [read_json(folder / "manifest.json") for folder in folders]
+            facts = list(map(manifest.read, folders))
             owners = list(map(identity.owners, facts))
             saved.extend(checkpoint.newest(places, job.abstract, say, owners=owners))
             if not saved:

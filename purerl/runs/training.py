@@ -15,10 +15,13 @@ from typing import Any
 
 from purerl.core.errors import UserError
 from purerl.exact import xla_flags
+from purerl.runs import output
 from purerl.runs.command_line import from_settings
 from purerl.runs.experiment import Experiment, Source, find_source
+from purerl.runs.files import check_name
 from purerl.runs.loaded_run import Run
 from purerl.runs.options import Options
+from purerl.runs.trust import remember
 
 
 def train(
@@ -58,7 +61,7 @@ def train(
     chosen, how = from_settings(source, settings or {}, options)
     if how.video:
         raise UserError("video is an option of the command; call `python -m purerl.render RUN`.")
-    runs = [Run(folder) for folder in train_runs(source, chosen, how, _interrupt)]
+    runs = [Run(folder, trust=True) for folder in train_runs(source, chosen, how, _interrupt)]
     return runs[0] if how.num_seeds == 1 else runs
 
 
@@ -75,12 +78,16 @@ def train_runs(
     """
     from purerl.runs.session import execute
 
+    check_name("The experiment's name", source.name)
+    if options.name is not None:
+        check_name("name", options.name)
     place, runs = options.runs / source.name, {}
     for seed in range(chosen.seed, chosen.seed + options.num_seeds):
         name = options.name or f"seed{seed}"
         if options.num_seeds > 1 and options.name:
             name += f"-seed{seed}"
         runs[place / name] = dataclasses.replace(chosen, seed=seed)
+    remember(source.text, source.path)
     with stop_signals(end) as stop:
         execute(source, runs, options, stop)
     return list(runs)
@@ -92,7 +99,7 @@ def set_xla_flags_in_time() -> None:
     Then the manifest says that the run is not bit-exact. On a CPU they change nothing.
     """
     if _runs_on_gpu() and xla_flags.how_chosen("gpu") == "by timing":
-        print(
+        output.say(
             "JAX has begun on the GPU with kernels chosen by timing, so this run is not bit-exact: "
             "call purerl.exact.set_xla_flags() before JAX's first computation."
         )
@@ -126,8 +133,7 @@ def stop_signals(end: Callable[[int], Any]) -> Iterator[Callable[[], bool]]:
             return
         received.append(number)
         name = signal.Signals(number).name
-        said = f"\n{name}: finishing this chunk, then saving. Once more to stop at once."
-        print(said, file=sys.stderr, flush=True)
+        output.warn(f"\n{name}: finishing this chunk, then saving. Once more to stop at once.")
 
     old = {}
     if threading.current_thread() is threading.main_thread():

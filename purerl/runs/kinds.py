@@ -1,0 +1,48 @@
+"""Does a JSON value fit a setting's annotation? What a folder says may be a stranger's."""
+
+import enum
+import types
+import typing
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin
+
+
+def hints(kind: type) -> dict[str, Any]:
+    """Returns the annotations of a dataclass's fields; {} where they name what is not there."""
+    try:
+        return typing.get_type_hints(kind)
+    except Exception:  # it evaluates text: any error
+        return {}
+
+
+def fits(hint: Any, value: Any) -> bool:
+    """Tells whether a JSON value can be read as `hint`; True for hints it does not know.
+
+    >>> fits(tuple[int, ...], [64, 64]), fits(tuple[int, ...], 64), fits(float | None, "fast")
+    (True, False, False)
+    """
+    origin, inner = get_origin(hint) or hint, get_args(hint)
+    if origin in (Union, types.UnionType):
+        return any(fits(one, value) for one in inner)
+    if origin is Literal:
+        return value in [getattr(one, "name", one) for one in inner]
+    if origin in (tuple, list):
+        every = origin is list or inner[1:] == (...,)
+        wanted = inner[:1] * len(value) if every and isinstance(value, list) else inner
+        return isinstance(value, list) and (not inner or _all_fit(wanted, value))
+    if origin is dict:
+        values = list(value.values()) if isinstance(value, dict) else []
+        return isinstance(value, dict) and (not inner or _all_fit(inner[1:] * len(values), values))
+    if origin is types.NoneType:
+        return value is None
+    if not isinstance(origin, type):
+        return True
+    if issubclass(origin, enum.Enum):
+        return isinstance(value, str) and value in origin.__members__
+    if issubclass(origin, int | float):  # a whole number may stand for a float, true for 1
+        return isinstance(value, int | float)
+    return not issubclass(origin, str | Path) or isinstance(value, str)
+
+
+def _all_fit(hints: Any, values: list) -> bool:
+    return len(hints) == len(values) and all(map(fits, hints, values))
