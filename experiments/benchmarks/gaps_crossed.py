@@ -21,7 +21,7 @@ from purerl.core.keys import Purpose, derive
 from purerl.core.records import Array, Network, Normal, PolicyOutput, TrainState
 from purerl.devices.compilation import set_up_jax
 from purerl.ppo.evaluation import evaluate
-from purerl.runs import build_experiment, run_folder
+from purerl.runs import build_experiment, restored_run
 from purerl.runs.command_errors import leave
 
 
@@ -90,13 +90,13 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--engine", default="", help="where it should not be the run's own")
     options = parser.parse_args(arguments)
     set_up_jax(cache=True)
-    trained = run_folder.restore(options.run, "latest", print, options.engine)
+    trained = restored_run.restore(options.run, "latest", print, options.engine)
     setup, state = trained.setup, trained.saved.state
     if "gaps_crossed_count" not in jax.eval_shape(setup.env.reset, jax.random.key(0)).metrics:
         raise UserError(f"{options.run} runs where there are no gaps; give a run in a corridor.")
     policies = {"trained": (setup, state)}
     if options.floor_run:
-        floor = run_folder.restore(options.floor_run, "latest", print, options.engine)
+        floor = restored_run.restore(options.floor_run, "latest", print, options.engine)
         size = count_features(floor.saved.state)
         extra = count_features(state) - size
         network = blind(floor.setup.network, size)

@@ -1,12 +1,16 @@
 """How a command ends: its exit code, and its error as one line."""
 
+import os
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from typing import NoReturn
 
 from purerl.core.errors import RunError, StoppedError, UserError
 from purerl.runs import output
+
+LAST_SECONDS = 15.0  # from the end of a command to that of its process
 
 
 def tell(error: UserError | RunError | StoppedError) -> int:
@@ -34,4 +38,16 @@ def leave(command: Callable[[], int]) -> NoReturn:
     except KeyboardInterrupt:
         code = 128 + signal.SIGINT
     output.settle(sys.stderr)
+    end_in_time(code)
     sys.exit(code)
+
+
+def end_in_time(code: int) -> None:
+    """Ends the process after some time at the latest, whatever threads of libraries still wait.
+
+    All that a command promises is done by now. On a disk without inodes, threads of Orbax waited
+    for ever.
+    """
+    timer = threading.Timer(LAST_SECONDS, os._exit, [code])
+    timer.daemon = True
+    timer.start()

@@ -10,7 +10,7 @@ from purerl.core.errors import UserError
 from purerl.runs.files import check_is_run, read_metrics
 
 if TYPE_CHECKING:
-    from purerl.runs import run_folder
+    from purerl.runs import restored_run
     from purerl.runs.policy import Policy
 
 
@@ -58,11 +58,11 @@ class Run:
     trust: bool = False
 
     @functools.cached_property
-    def restored(self) -> "run_folder.RestoredRun":
+    def restored(self) -> "restored_run.RestoredRun":
         """The experiment rebuilt, and the checkpoint."""
         from purerl.devices.compilation import set_up_jax
         from purerl.runs.output import show
-        from purerl.runs.run_folder import restore
+        from purerl.runs.restored_run import restore
 
         set_up_jax(cache=True)
         return restore(self.folder, self.checkpoint, show, self.engine, self.trust)

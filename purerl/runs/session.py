@@ -104,10 +104,11 @@ def execute(
                 locks[folder] = RunLock(folder)
                 stack.callback(locks[folder].close)
             check(runs, options.resume)  # another may have been here
+            begun = any(map(run_folder.is_begun, runs))
             for folder, one in runs.items():
                 settings = run_folder.describe(source, one, schedule)
                 run_folder.begin_or_go_on(
-                    folder, source, settings, facts, abstract, options.allow_changes
+                    folder, source, settings, facts, abstract, options.allow_changes, begun
                 )
             for line in console.describe_plan(plan, setup, abstract, facts, list(runs), cache):
                 output.say(line)
@@ -142,7 +143,7 @@ def _tell_unordered(folders: Iterable[Path], exactness: dict[str, Any], places: 
 @run_folder.refusals()
 def _shards_on_disk(folders: Iterable[Path]) -> int:
     """Returns how many shards a run was begun with, 0 if there is none yet."""
-    begun = [folder for folder in folders if (folder / "config.json").exists()]
+    begun = [folder for folder in folders if run_folder.is_begun(folder)]
     return manifest.read(begun[0])["num_shards"] if begun else 0
 
 

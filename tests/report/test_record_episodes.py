@@ -15,7 +15,7 @@ from purerl.core.errors import USAGE
 from purerl.ppo import running_moments
 from purerl.ppo.networks import GaussianHead
 from purerl.report import episode_arrays
-from purerl.runs import run_folder
+from purerl.runs import restored_run
 
 TRAIN = """
 import dataclasses
@@ -46,7 +46,7 @@ def train_and_record(place: Path, build: str, network: str) -> Recorded:
     words = ["--episodes", "3", "--seed", "5", "--out", str(out)]
     assert record.main([str(folder), *words]) == 0
     return Recorded(
-        folder, dict(np.load(out)), run_folder.restore(folder, "latest", print).saved.state
+        folder, dict(np.load(out)), restored_run.restore(folder, "latest", print).saved.state
     )
 
 

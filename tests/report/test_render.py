@@ -19,7 +19,7 @@ from purerl.core.errors import FAILURE, USAGE, RunError
 from purerl.core.keys import per_environment
 from purerl.report import episode_pictures, opengl, renderer as drawing
 from purerl.runs.policy import Policy
-from purerl.runs.run_folder import restore
+from purerl.runs.restored_run import restore
 from tests import quick
 
 TINY = "--ppo.num-envs 4 --ppo.rollout-length 8 --ppo.num-steps 96 --ppo.num-minibatches 2"

@@ -172,6 +172,19 @@ def test_leaves_that_look_alike_stay_apart():
     assert rebuilt["foot"]["left"] == 1 and rebuilt["foot/left"] == 2
 
 
+# --- what has no checkpoint ---
+
+
+@pytest.mark.parametrize("more", [[], ["--resume"]])
+def test_a_mistake_found_late_does_not_block_its_own_correction(tmp_path, whole, stop_after, more):  # noqa: F811
+    stop_after(0)
+    start(tmp_path, *WORDS, "--ppo.gamma", "0.5", "--num-shards", "2")
+    assert (folder(tmp_path) / "config.json").exists() and checkpoints(tmp_path) == []
+    stop_after(10**9)
+    assert start(tmp_path, *WORDS, *more) == SUCCESS
+    assert lines(tmp_path) == lines(whole)
+
+
 # --- what cannot be read is not damaged ---
 
 

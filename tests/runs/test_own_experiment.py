@@ -7,7 +7,7 @@ import pytest
 
 from purerl import evaluate, run
 from purerl.core import errors
-from purerl.runs import run_folder
+from purerl.runs import restored_run
 
 ROOT = Path(__file__).parent.parent.parent
 MINE = """
@@ -236,7 +236,7 @@ def test_a_run_whose_checkpoints_are_gone_says_that_it_begins_anew(place, capsys
 def test_a_folder_of_runs_lists_them(place, capsys):
     assert train(place) == errors.SUCCESS
     place_of_run = place / "runs" / "mine" / "seed1"
-    assert run_folder.restore(str(place_of_run), "latest", print).saved.meta["update"] == 4
+    assert restored_run.restore(str(place_of_run), "latest", print).saved.meta["update"] == 4
     for folder, message in [
         (place_of_run.parent, f"Runs in it: {place_of_run}."),
         (place_of_run.parent / "sed1", "sed1 is no folder"),

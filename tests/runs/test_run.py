@@ -493,6 +493,20 @@ def test_ctrl_c_before_anything_has_begun_is_no_traceback():
     assert ended.value.code == 128 + signal.SIGINT
 
 
+def test_a_thread_that_waits_for_ever_does_not_keep_the_process():
+    code = """
+import threading
+from purerl.runs import command_errors
+command_errors.LAST_SECONDS = 0.5
+def command():
+    threading.Thread(target=threading.Event().wait).start()
+    return 1
+command_errors.leave(command)
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=30)
+    assert done.returncode == 1
+
+
 def test_an_error_of_any_command_is_one_line_and_its_code(capsys):
     def mistaken():
         raise errors.UserError("Give a run.")

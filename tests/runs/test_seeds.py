@@ -114,7 +114,7 @@ def test_vmapped_seeds_are_the_same_each_time(vmapped, tmp_path):
 
 
 def test_each_vmapped_seed_is_a_run_that_others_can_read(vmapped):
-    from purerl.runs.run_folder import restore
+    from purerl.runs.restored_run import restore
 
     for number, seed in enumerate(SEEDS, 1):
         found = restore(folder(vmapped, seed), "latest", print)
@@ -167,7 +167,7 @@ def test_a_lost_seed_is_named(tmp_path, stop_after, capsys):
     start(tmp_path, *THREE)
     path = folder(tmp_path, "seed2") / "checkpoints" / f"{6:012d}"
     meta = checkpoint_folder.load_meta(path)
-    from purerl.runs.run_folder import restore
+    from purerl.runs.restored_run import restore
 
     setup = restore(folder(tmp_path, "seed2"), "latest", print).setup
     state = checkpoint.load(path, programs.abstract_state(*setup[:3])).state
