@@ -5,9 +5,11 @@ policy acts by its distribution's centre. It is played on whole episodes, and ho
 actions are from the run's own is printed.
 
     npz    arrays by name, for numpy: networks.mlp and networks.recurrent
+    jax    a program of jax.export, for JAX on any device: any network
 """
 
 import importlib
+import importlib.util
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,12 +21,14 @@ from purerl.runs.command_errors import leave
 from purerl.runs.command_line import carry_out
 from purerl.runs.options import PlayOptions
 
+NEEDS = {"npz": (), "jax": ("flatbuffers",), "onnx": ("onnx", "onnxruntime")}  # format: packages
+
 
 @dataclass(frozen=True)
 class Options(PlayOptions):  # noqa: D101 (--help prints the page above)
     __doc__ = __doc__
 
-    format: Literal["npz"] = "npz"
+    format: Literal["npz", "jax"] = "npz"
     """Kind of file."""
     out: Path | None = None
     """File to write (default: policy.npz, policy.jax or policy.onnx)."""
@@ -44,14 +48,21 @@ def command(options: Options) -> None:
     place = file.absolute().parent
     if not os.access(place, os.W_OK) or file.is_dir():
         raise UserError(f"{file} cannot be written: is {place} a folder of yours?")
+    write = writer(options.format)
     run = load(options.run, options.checkpoint, options.engine)
-    policy = writer(options.format)(run, file)
+    policy = write(run, file)
     print(record_episodes(run, options.seed).compare(policy))
     print(f"{file} ({file.stat().st_size:,} bytes)")
 
 
 def writer(name: str) -> Any:
     """Returns the function that writes a format: only what it needs is imported."""
+    missing = [package for package in NEEDS[name] if importlib.util.find_spec(package) is None]
+    if missing:
+        raise UserError(
+            f"--format {name} needs {', '.join(missing)}: python -m pip install -c constraints.txt "
+            "-e '.[export]'"
+        )
     return getattr(importlib.import_module(f"purerl.report.policy_{name}"), f"write_{name}")
 
 

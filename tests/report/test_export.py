@@ -1,6 +1,5 @@
 """`python -m purerl.export RUN`: the policy that was taken away is the run's own."""
 
-import dataclasses
 import functools
 import re
 import subprocess
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 
 import purerl
+from experiments import custom_network
 from purerl import __main__ as commands
 from purerl.core.errors import USAGE
 from purerl.report import episode_arrays, numpy_policy, policy_npz
@@ -21,13 +21,16 @@ from tests.golden import privileged, recurrent
 from tests.test_readme import PAGES, blocks
 
 ROOT = Path(__file__).parent.parent.parent
+PYTHON = blocks(PAGES["docs/export.md"].read_text(), "python")
 SLOW = pytest.mark.slow
 FEW = {"ppo.num_steps": 256, "network.value_hidden": (8,), "evaluation.number": 0}
+OWN = {"ppo.num_steps": 512, "ppo.num_envs": 4, "ppo.rollout_length": 16, "ppo.episode_length": 20}
 KINDS = {
     "relu": (privileged, {"network.activation": "relu"}),
     "elu": (privileged, {"network.activation": "elu", "network.policy_hidden": (9, 7)}),
     "gru": (recurrent, {"network.cell": "gru", "network.activation": "tanh"}),
     "lstm": (recurrent, {}),
+    "own": (custom_network, OWN),
 }
 
 
@@ -46,7 +49,11 @@ def shaken(run: purerl.Run) -> purerl.Run:
 @functools.cache
 def trained(kind: str, place: Path) -> tuple[purerl.Run, Recorded]:
     module, settings = KINDS[kind]
-    run = shaken(purerl.train(module.__file__, FEW | settings, name=kind, runs=place))
+    run = shaken(
+        purerl.train(
+            module.__file__, (settings if kind == "own" else FEW | settings), name=kind, runs=place
+        )
+    )
     recorded = record_episodes(run, seed=1)
     assert np.std(recorded.action) > 0.1
     return run, recorded
@@ -124,11 +131,8 @@ def test_the_command_writes_it(place, tmp_path, capsys, monkeypatch):
 
 def test_mistakes_are_one_line(place, tmp_path, capsys):
     run, _ = trained("relu", place)
-    own = dataclasses.replace(run.experiment, build_network=lambda *_: None)
-    other = purerl.load(run.folder)
-    other.__dict__["restored"] = run.restored._replace(experiment=own)
     with pytest.raises(purerl.UserError, match="network is one of your own: use --format jax"):
-        policy_npz.write_npz(other, tmp_path / "p.npz")
+        policy_npz.write_npz(trained("own", place)[0], tmp_path / "p.npz")
     assert not (tmp_path / "p.npz").exists()
     for out in (tmp_path / "no" / "p.npz", tmp_path):
         assert commands.main(["export", str(run.folder), "--out", str(out)]) == USAGE
@@ -136,9 +140,50 @@ def test_mistakes_are_one_line(place, tmp_path, capsys):
         assert "cannot be written" in said and said.count("\n") == 1
 
 
+# --- jax ---
+
+
+def without_purerl(code: str, place: Path) -> str:
+    """Runs code in a folder, in a process of its own that has not imported purerl."""
+    check = "\nimport sys\nassert not [name for name in sys.modules if 'purerl' in name]\n"
+    command = [sys.executable, "-c", code + check]
+    done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("kind", ["relu", "lstm", "own"])
+def test_jax_reads_the_program_in_a_process_without_purerl(kind, place, tmp_path):
+    pytest.importorskip("flatbuffers")
+    from purerl.report import policy_jax
+
+    run, recorded = trained(kind, place)
+    assert recorded.difference(policy_jax.write_jax(run, tmp_path / "policy.jax")) < 2e-6
+    np.savez(tmp_path / "seen.npz", **recorded.parts())
+    (block,) = [block for block in PYTHON if "deserialize" in block]
+    said = without_purerl(block + EPISODES, tmp_path)
+    # What only the value function reads is not asked for.
+    assert said == ("['policy']\n" if kind == "relu" else "array\n")
+    actions = np.load(tmp_path / "actions.npy")
+    np.testing.assert_allclose(actions.swapaxes(0, 1), recorded.action, atol=2e-6)
+
+
+EPISODES = """
+seen, actions = dict(np.load("seen.npz")), []
+memory = jax.tree.map(lambda x: np.zeros((8, *x.shape[1:]), x.dtype), memory)
+for t in range(20):
+    now = {name: x[:, t] for name, x in seen.items()}
+    now = {name: now[name] for name in observation} if isinstance(observation, dict) else now[""]
+    action, memory = program.call(now, memory)
+    actions.append(action)
+np.save("actions.npy", actions)
+print(sorted(observation) if isinstance(observation, dict) else "array")
+"""
+
+
 # --- the page ---
 
-READER, DRIVE = blocks(PAGES["docs/export.md"].read_text(), "python")[:2]
+READER, DRIVE = PYTHON[0], PYTHON[-1]
 
 
 def test_the_page_shows_the_reader():
