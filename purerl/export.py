@@ -6,6 +6,7 @@ actions are from the run's own is printed.
 
     npz    arrays by name, for numpy: networks.mlp and networks.recurrent
     jax    a program of jax.export, for JAX on any device: any network
+    onnx   a graph, operator set 17: networks of layers, cells and elementwise functions
 """
 
 import importlib
@@ -28,7 +29,7 @@ NEEDS = {"npz": (), "jax": ("flatbuffers",), "onnx": ("onnx", "onnxruntime")}  #
 class Options(PlayOptions):  # noqa: D101 (--help prints the page above)
     __doc__ = __doc__
 
-    format: Literal["npz", "jax"] = "npz"
+    format: Literal["npz", "jax", "onnx"] = "npz"
     """Kind of file."""
     out: Path | None = None
     """File to write (default: policy.npz, policy.jax or policy.onnx)."""

@@ -1,7 +1,7 @@
 """A JAX function as a flat list of steps, with what is constant computed: to be written elsewhere.
 
 Functions within functions are opened, steps that no output needs are left out. The first axis of
-every input may have any size, `batch`.
+every input is the batch. It is traced with a size that nothing else has, and may have any other.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax import export
 from jax.extend.core import Literal
 
 from purerl.core.records import PyTree
@@ -22,6 +21,9 @@ _CALLS = {
 }  # fmt: skip
 _BODIES = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 
+# A prime: what it divides depends on the batch. No array of that size is made.
+BATCH = 1_000_003
+
 Value = int | np.ndarray  # the number of an input or of a step's result, or a constant
 
 
@@ -32,7 +34,7 @@ class Step(NamedTuple):
     params: dict[str, Any]
     inputs: tuple[Value, ...]
     outputs: tuple[int, ...]
-    types: tuple[Any, ...]  # of the inputs: shapes may hold `batch`, which is no int
+    types: tuple[Any, ...]  # of the inputs
     result: Any  # type of the first output
 
 
@@ -58,15 +60,14 @@ def flat_program(function: Callable[..., PyTree], *examples: PyTree) -> Program:
     return Program(steps, outputs, frozenset(needed & set(inputs)))
 
 
-def batched(examples: PyTree) -> PyTree:
-    """Returns the shapes of `examples` with a first axis of any size, `batch`."""
-    (batch,) = export.symbolic_shape("batch")
+def batched(examples: PyTree, batch: Any = BATCH) -> PyTree:
+    """Returns the shapes of `examples` with a first axis of that size."""
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct((batch, *x.shape), x.dtype), examples)
 
 
-def sizes(shape: Sequence[Any], unknown: int) -> list[int]:
-    """Returns a shape as integers, with `unknown` for what depends on the batch."""
-    return [size if isinstance(size, int) else unknown for size in shape]
+def sizes(shape: Sequence[int], unknown: int) -> list[int]:
+    """Returns a shape with `unknown` for the sizes that depend on the batch."""
+    return [unknown if size and size % BATCH == 0 else size for size in shape]
 
 
 def _needed(steps: Sequence[Step], outputs: Sequence[Value]) -> tuple[list[Step], set[int]]:

@@ -19,7 +19,7 @@ PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 def write_jax(run: Run, file: Path) -> Callable[[Any], np.ndarray]:
     """Writes a policy by `jax.export`; returns that of the file, of observations [N, ...]."""
     policy = policy_function(run)
-    arguments = batched((policy.observation, policy.memory))
+    arguments = batched((policy.observation, policy.memory), *export.symbolic_shape("batch"))
     exported = export.export(jax.jit(policy.act), platforms=PLATFORMS)(*arguments)
     file.write_bytes(exported.serialize())
     return remembering(policy, export.deserialize(bytearray(file.read_bytes())).call)
