@@ -10,7 +10,7 @@ from purerl.runs.command_errors import leave, tell
 from purerl.runs.experiment import summary
 from purerl.runs.output import show
 
-COMMANDS = ("run", "evaluate", "render", "record", "compare")
+COMMANDS = ("run", "evaluate", "render", "record", "export", "compare")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

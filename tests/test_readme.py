@@ -66,7 +66,7 @@ def help_page(*words):
 def all_help():
     """Returns the help pages of all our commands, those of `run` for two experiments."""
     pages = [help_page("purerl.run", name) for name in ("ant_gaps", "suite")]
-    names = ("evaluate", "render", "compare", "record")
+    names = ("evaluate", "render", "compare", "record", "export")
     return "".join([*pages, *(help_page(f"purerl.{name}") for name in names)])
 
 

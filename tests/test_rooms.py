@@ -22,7 +22,7 @@ MAY_IMPORT = {
     "runs": {"core", "exact", "ppo", "physics", "devices"},
     "report": {"core", "ppo", "physics", "devices", "runs"},
 }
-COMMANDS = {"compare", "evaluate", "record", "render", "run"}
+COMMANDS = {"compare", "evaluate", "export", "record", "render", "run"}
 MODULES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
     for path in HOUSE.rglob("*.py")

@@ -1,0 +1,71 @@
+"""Takes a policy away: `python -m purerl.export RUN [--format npz|jax|onnx] [--out F]`.
+
+Normalization, memory and squashing are inside the file; docs/export.md shows how to read it. The
+policy acts by its distribution's centre. It is played on whole episodes, and how far the file's
+actions are from the run's own is printed.
+
+    npz    arrays by name, for numpy: networks.mlp and networks.recurrent
+    jax    a program of jax.export, for JAX on any device: any network
+    onnx   a graph, operator set 17: networks of layers, cells and elementwise functions
+"""
+
+import importlib
+import importlib.util
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from purerl.core.errors import UserError
+from purerl.runs.command_errors import leave
+from purerl.runs.command_line import carry_out
+from purerl.runs.options import PlayOptions
+
+NEEDS = {"npz": (), "jax": ("flatbuffers",), "onnx": ("onnx", "onnxruntime")}  # format: packages
+
+
+@dataclass(frozen=True)
+class Options(PlayOptions):  # noqa: D101 (--help prints the page above)
+    __doc__ = __doc__
+
+    format: Literal["npz", "jax", "onnx"] = "npz"
+    """Kind of file."""
+    out: Path | None = None
+    """File to write (default: policy.npz, policy.jax or policy.onnx)."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    return carry_out(Options, command, "python -m purerl.export", arguments)
+
+
+def command(options: Options) -> None:
+    """Writes the file and tells how near it comes."""
+    from purerl.report.policy_file import record_episodes
+    from purerl.runs.loaded_run import load
+
+    file = options.out or Path(f"policy.{options.format}")
+    place = file.absolute().parent
+    if not os.access(place, os.W_OK) or file.is_dir():
+        raise UserError(f"{file} cannot be written: is {place} a folder of yours?")
+    write = writer(options.format)
+    run = load(options.run, options.checkpoint, options.engine)
+    policy = write(run, file)
+    print(record_episodes(run, options.seed).compare(policy))
+    print(f"{file} ({file.stat().st_size:,} bytes)")
+
+
+def writer(name: str) -> Any:
+    """Returns the function that writes a format: only what it needs is imported."""
+    missing = [package for package in NEEDS[name] if importlib.util.find_spec(package) is None]
+    if missing:
+        raise UserError(
+            f"--format {name} needs {', '.join(missing)}: python -m pip install -c constraints.txt "
+            "-e '.[export]'"
+        )
+    return getattr(importlib.import_module(f"purerl.report.policy_{name}"), f"write_{name}")
+
+
+if __name__ == "__main__":
+    leave(main)

@@ -1,0 +1,158 @@
+"""A policy as a graph of ONNX: the steps of JAX's own program, each as a node."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import onnx
+import onnxruntime
+from onnx import helper, numpy_helper
+
+from purerl.core.records import Array, PyTree
+from purerl.report.flat_program import Program, Value, batched, flat_program, sizes
+from purerl.report.onnx_nodes import OPSET, write_step
+from purerl.report.policy_file import control_range, origin
+from purerl.report.policy_function import PolicyFunction, policy_function
+from purerl.report.policy_jax import remembering
+from purerl.runs.loaded_run import Run
+
+IR_VERSION = 8  # the file format that goes with the operator set
+
+
+def write_onnx(run: Run, file: Path) -> Callable[[Any], np.ndarray]:
+    """Writes a policy as ONNX; returns that of the file, of observations [N, ...].
+
+    Raises:
+      UserError: the network computes what ONNX or this writer has not.
+    """
+    policy = policy_function(run)
+    model = build_model(policy, control_range(run), origin(run))
+    onnx.checker.check_model(model, full_check=True)
+    file.write_bytes(model.SerializeToString())
+    return remembering(policy, caller(file))
+
+
+def names(prefix: str, tree: PyTree) -> list[str]:
+    """Returns a name for each leaf: `memory`, or `memory_0`, `memory_1`; of a dict, its keys'."""
+    paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(tree)]
+    said = [jax.tree_util.keystr(path, simple=True, separator="_") for path in paths]
+    return [f"{prefix}_{name}" if name else prefix for name in said]
+
+
+def build_model(
+    policy: PolicyFunction, limits: np.ndarray | None, notes: dict[str, Any]
+) -> onnx.ModelProto:
+    """Returns the model: observation and memory in; action, control and the next memory out.
+
+    Args:
+      policy: the function.
+      limits: [A, 2] what actions -1 and 1 are as controls; None: no control comes out.
+      notes: of the model, name -> text.
+    """
+
+    def outputs(observation: PyTree, memory: PyTree) -> tuple[Array, list[Array], PyTree]:
+        action, memory = policy.act(observation, memory)
+        if limits is None:
+            return action, [], memory
+        low, high = jnp.asarray(limits).T
+        return action, [low + 0.5 * (action + 1.0) * (high - low)], memory
+
+    arguments = (policy.observation, policy.memory)
+    program = flat_program(outputs, *arguments)
+    given = names("observation", policy.observation) + names("memory", policy.memory)
+    taken = ["action", "control"][: 1 + (limits is not None)] + names("next_memory", policy.memory)
+    made = jax.tree.leaves(jax.eval_shape(outputs, *batched(arguments)))
+    nodes = Nodes(given)
+    nodes.write(program, taken)
+    graph = helper.make_graph(
+        nodes.nodes,
+        "policy",
+        [_info(name, x.shape) for name, x in zip(given, jax.tree.leaves(arguments), strict=True)],
+        [_info(name, x.shape[1:]) for name, x in zip(taken, made, strict=True)],
+        nodes.constants,
+    )
+    opset = [helper.make_opsetid("", OPSET)]
+    model = helper.make_model(graph, opset_imports=opset, ir_version=IR_VERSION)
+    helper.set_model_props(model, {name: str(value) for name, value in notes.items()})
+    return model
+
+
+def _info(name: str, shape: tuple[int, ...]) -> onnx.ValueInfoProto:
+    return helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["batch", *shape])
+
+
+class Nodes:
+    """The nodes of a graph and its constants, as they are collected."""
+
+    def __init__(self, given: list[str]) -> None:
+        """Begins with the names of the inputs."""
+        self.names: dict[int, str] = dict(enumerate(given))  # value -> name
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: list[onnx.TensorProto] = []
+        self.shapes: dict[tuple[int, ...], str] = {}  # with 0 for the batch -> name
+        self.first = given[0]
+
+    def write(self, program: Program, outputs: list[str]) -> None:
+        """Adds a program's steps; its outputs get their names."""
+        for step in program.steps:
+            made = write_step(self, step, list(step.inputs))
+            many = made if isinstance(made, list) else [made]
+            self.names |= dict(zip(step.outputs, many, strict=True))
+        for value, name in zip(program.outputs, outputs, strict=True):
+            whole = self.name(value)
+            self.nodes.append(helper.make_node("Identity", [whole], [name]))
+
+    def name(self, value: Value | str) -> str:
+        """Returns the name of a value, a constant being added under a new one."""
+        if isinstance(value, str):
+            return value
+        if isinstance(value, int):
+            return self.names[value]
+        name = f"constant_{len(self.constants)}"
+        self.constants.append(numpy_helper.from_array(np.array(value, order="C"), name))
+        return name
+
+    def node(self, kind: str, *inputs: Value | str, outputs: int = 1, **attributes: Any) -> Any:
+        """Adds a node; returns the name of its output, or a list of them."""
+        made = [f"{kind.lower()}_{len(self.nodes)}_{i}" for i in range(outputs)]
+        self.nodes.append(helper.make_node(kind, [*map(self.name, inputs)], made, **attributes))
+        return made if outputs > 1 else made[0]
+
+    def batched(self, value: Value | str, shape: tuple[Any, ...]) -> str:
+        """Returns a value at its full shape, where it was only broadcast so far."""
+        if isinstance(value, int):
+            return self.name(value)
+        key = tuple(sizes(shape, 0))
+        if key == shape:
+            return self.node("Expand", value, np.asarray(shape, np.int64))
+        if key not in self.shapes:
+            self.shapes[key] = self._shape(key)
+        return self.node("Expand", value, self.shapes[key])
+
+    def _shape(self, shape: tuple[int, ...]) -> str:
+        """Adds a shape with the batch's size where there is a 0."""
+        size = self.node("Slice", self.node("Shape", self.first), _one(0), _one(1))
+        return self.node("Concat", *(_one(n) if n else size for n in shape), axis=0)
+
+
+def _one(number: int) -> np.ndarray:
+    return np.asarray([number], np.int64)
+
+
+def caller(file: Path) -> Callable[[PyTree, PyTree], tuple[np.ndarray, PyTree]]:
+    """Returns the file's function of (observation, memory), by onnxruntime on the CPU."""
+    session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    given = [entry.name for entry in session.get_inputs()]
+    taken = [entry.name for entry in session.get_outputs() if entry.name != "control"]
+
+    def call(observation: PyTree, memory: PyTree) -> tuple[np.ndarray, PyTree]:
+        leaves, tree = jax.tree.flatten(memory)
+        values = [*jax.tree.leaves(observation), *leaves]
+        arrays = {n: np.asarray(x, np.float32) for n, x in zip(given, values, strict=True)}
+        action, *following = session.run(taken, arrays)
+        return action, jax.tree.unflatten(tree, following)
+
+    return call
