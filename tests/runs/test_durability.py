@@ -200,14 +200,14 @@ def no_orbax(monkeypatch):
 
 
 def too_many_files(monkeypatch):
-    read = Path.read_bytes
+    opened = os.open
 
-    def refuse(path):
+    def refuse(path, *how, **more):
         if "checkpoints" in str(path):
             raise OSError(errno.EMFILE, "Too many open files", str(path))
-        return read(path)
+        return opened(path, *how, **more)
 
-    monkeypatch.setattr(Path, "read_bytes", refuse)
+    monkeypatch.setattr(os, "open", refuse)
 
 
 def no_memory(monkeypatch):
