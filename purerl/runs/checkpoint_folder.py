@@ -94,7 +94,8 @@ def verify(path: Path) -> dict[str, Any]:
       DamagedError: a file is not what was written.
       UserError: a file cannot be read, or the checkpoint is of another update than its name says.
     """
-    check_plain(path)
+    with reading(path):
+        check_plain(path)
     meta = load_meta(path)
     if path_of(path.parent, meta["update"]) != path and path.name.isdigit():
         raise UserError(
