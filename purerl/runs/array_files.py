@@ -15,13 +15,18 @@ def write(folder: Path, arrays: dict[str, np.ndarray]) -> None:
         checkpointer.save(folder.absolute(), _orbax().args.PyTreeSave(arrays))
 
 
-def read(folder: Path, like: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def read(folder: Path, like: dict[str, Any]) -> dict[str, np.ndarray]:
     """Reads arrays of the names, shapes and dtypes of `like`; raises what Orbax raises."""
     ocp = _orbax()
+    wanted = {key: jax.ShapeDtypeStruct(x.shape, x.dtype) for key, x in like.items()}
     kinds = {key: ocp.RestoreArgs(np.ndarray, dtype=x.dtype) for key, x in like.items()}
-    wanted = ocp.args.PyTreeRestore(like, restore_args=kinds, partial_restore=True)
+    how = ocp.args.PyTreeRestore(wanted, restore_args=kinds, partial_restore=True)
     with _checkpointer() as checkpointer:
-        return checkpointer.restore(folder.absolute(), wanted)
+        found = checkpointer.restore(folder.absolute(), how)
+    for key, x in found.items():
+        if not isinstance(x, np.ndarray):  # Orbax hands back what it was given
+            raise ValueError(f"leaf {key} is not there")
+    return found
 
 
 def _checkpointer() -> Any:

@@ -52,6 +52,8 @@ def save(folder: Path, leaves: Leaves, meta: dict[str, Any]) -> Path:
         draft.mkdir()
         array_files.write(draft / "state", stored)
         meta = meta | {"leaves": {key: _describe(array) for key, array in leaves.items()}}
+        # Where a folder could not be listed for a moment, Orbax left arrays out, and said nothing.
+        _compare(array_files.read(draft / "state", stored), meta["leaves"])
         meta["files"] = hash_files(draft)
         meta["meta_sha256"] = checkpoint_folder.hash_meta(meta)
         (draft / META).write_text(json.dumps(meta))
@@ -84,17 +86,15 @@ def load(path: Path, abstract: PyTree, owners: Sequence[Owner] = ()) -> Saved:
     verify(path)
     leaves = {key: np.zeros(shape, jnp.dtype(dtype)) for key, (dtype, shape) in wanted.items()}
     try:
-        read = array_files.read(path / "state", {key: x for key, x in leaves.items() if x.size})
-        leaves |= {key: read[key] for key in leaves.keys() & read.keys()}
-        for key, array in leaves.items():
-            if _describe(array) != meta["leaves"][key]:
-                raise ValueError(f"leaf {key} comes back otherwise (sha256 differs)")
+        leaves |= array_files.read(path / "state", {k: x for k, x in leaves.items() if x.size})
+        _compare(leaves, meta["leaves"])
         if leaves.keys() == meta["leaves"].keys() and digest_leaves(leaves) != meta["digest"]:
             raise ValueError("the digest of all leaves is another")
     except Exception as error:  # Orbax raises many kinds. Its files are what it wrote, so:
         raise UserError(
-            f"The checkpoint {path} is whole on the disk, but cannot be read: {one_line(error)}. "
-            "Nothing was changed: mend the installation, the memory or the limits of this process."
+            f"The checkpoint {path} is whole on the disk, but cannot be read: "
+            f"{one_line(error):.300}. Nothing was changed: mend the installation, the memory or "
+            "the limits of this process."
         ) from error
     return Saved(unflatten(leaves, abstract), meta)
 
@@ -147,6 +147,13 @@ def check_fits(folder: Path, abstract: PyTree) -> None:
 def _describe(array: np.ndarray) -> dict[str, Any]:
     content = hashlib.sha256(np.asarray(array).tobytes()).hexdigest()
     return {"dtype": str(array.dtype), "shape": list(array.shape), "sha256": content}
+
+
+def _compare(leaves: Leaves, expected: dict[str, Any]) -> None:
+    """Raises ValueError unless arrays that were read are those that were written."""
+    for key, array in leaves.items():
+        if _describe(array) != expected[key]:
+            raise ValueError(f"leaf {key} comes back otherwise (sha256 differs)")
 
 
 def _check_fits(path: Path, meta: dict[str, Any], abstract: PyTree) -> dict[str, tuple]:

@@ -1,5 +1,6 @@
 """Loggers: metrics.jsonl is exact, the others can do no harm."""
 
+import hashlib
 import json
 import threading
 import time
@@ -7,7 +8,8 @@ import time
 import pytest
 
 from purerl.core.errors import UserError
-from purerl.runs.loggers import BackgroundLogger, MetricsFile, _TensorBoardSink, summarize
+from purerl.runs.loggers import BackgroundLogger, _TensorBoardSink, summarize
+from purerl.runs.metrics_file import MetricsFile
 
 
 def test_counts_are_summed_and_episodes_weigh_by_their_number():
@@ -31,26 +33,36 @@ def test_nothing_is_said_of_episodes_when_none_ended():
     assert summarize([{"episodes": 0.0, "episode_return": 0.0}])["episode_return"] is None
 
 
+EMPTY = hashlib.sha256().hexdigest()
+
+
+def append(file, record):
+    file.add(record)
+    file.write()
+
+
 def test_lines_are_whole_and_strict_json(tmp_path):
-    file = MetricsFile(tmp_path / "m", 0)
-    first = file.append({"a": float("nan"), "b": 1})
-    file.append({"a": float("inf"), "b": 2})
+    file = MetricsFile(tmp_path / "m", 0, EMPTY)
+    append(file, {"a": float("nan"), "b": 1})
+    first = file.flush()
+    append(file, {"a": float("inf"), "b": 2})
     lines = (tmp_path / "m").read_bytes().splitlines(keepends=True)
-    assert first == len(lines[0])
+    assert first["metrics_bytes"] == len(lines[0])
+    assert first["metrics_sha256"] == hashlib.sha256(lines[0]).hexdigest()
     assert [json.loads(line) for line in lines] == [{"a": None, "b": 1}, {"a": None, "b": 2}]
-    MetricsFile(tmp_path / "m", first)
+    MetricsFile(tmp_path / "m", first["metrics_bytes"], first["metrics_sha256"])
     assert (tmp_path / "m").read_bytes() == lines[0]
 
 
 def test_a_shortened_file_is_refused(tmp_path):
     (tmp_path / "m").write_text("{}\n")
-    with pytest.raises(UserError, match="3 bytes.*after 10"):
-        MetricsFile(tmp_path / "m", 10)
+    with pytest.raises(UserError, match="of the 10 bytes .* it has 3 bytes"):
+        MetricsFile(tmp_path / "m", 10, EMPTY)
 
 
 def test_a_full_disk_leaves_no_gap_and_no_torn_line(tmp_path):
-    file = MetricsFile(tmp_path / "m", 0)
-    file.append({"n": 1})
+    file = MetricsFile(tmp_path / "m", 0, EMPTY)
+    append(file, {"n": 1})
     raw, room = file.file, [3]
 
     class Full:
@@ -64,10 +76,10 @@ def test_a_full_disk_leaves_no_gap_and_no_torn_line(tmp_path):
     file.file = Full()
     for number in (2, 3):
         with pytest.raises(OSError):
-            file.append({"n": number})
+            append(file, {"n": number})
         assert (tmp_path / "m").read_text() == '{"n": 1}\n'
     file.file = raw
-    file.append({"n": 4})
+    append(file, {"n": 4})
     assert (tmp_path / "m").read_text() == "".join(f'{{"n": {n}}}\n' for n in (1, 2, 3, 4))
 
 
