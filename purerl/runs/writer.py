@@ -158,5 +158,8 @@ class RunWriter:
         self.say(f"{message} Training goes on.")
 
     def _newest(self) -> str:
-        found = checkpoint_folder.updates(self.checkpoints)
+        try:
+            found = checkpoint_folder.updates(self.checkpoints)
+        except OSError:  # what made the save fail may make this fail too
+            return "unknown"
         return f"of update {found[-1]}" if found else "none"

@@ -180,7 +180,8 @@ def place_of(path: str) -> str:
 def choose(cases: list[Case], every: int, sample: int, seed: int) -> list[Case]:
     """Returns some of the cases: of each group every so many, or a sample in which all groups are.
 
-    Groups come in turn, in an order drawn from the seed, until the sample is full.
+    Groups come in turn, those of lasting faults first, the others in an order drawn from the seed,
+    until the sample is full.
     """
     groups: dict[tuple[str, ...], list[Case]] = {}
     for case in cases:
@@ -190,6 +191,7 @@ def choose(cases: list[Case], every: int, sample: int, seed: int) -> list[Case]:
     draw = random.Random(seed)
     mixed = [draw.sample(group, len(group)) for group in groups.values()]
     draw.shuffle(mixed)
+    mixed.sort(key=lambda group: group[0].fault.once)
     rounds = itertools.chain.from_iterable(itertools.zip_longest(*mixed))
     return [case for case in rounds if case is not None][:sample]
 

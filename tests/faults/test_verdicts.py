@@ -95,4 +95,6 @@ def test_every_call_fails_with_every_error_and_a_sample_has_all_groups():
     groups = {case.group for case in cases}
     assert {case.group for case in choose(cases, 1, len(groups), 3)} == groups
     assert {case.group for case in choose(cases, 100, 0, 0)} == groups
+    lasting = {case.group for case in cases if not case.fault.once}
+    assert lasting and {case.group for case in choose(cases, 1, len(lasting), 3)} == lasting
     assert len(choose(cases, 1, 0, 0)) == len(cases) and set(ERRORS) == set(shim.KINDS)

@@ -10,6 +10,6 @@ from tests.faults.verdicts import SHORT
 @pytest.mark.slow
 @pytest.mark.skipif(not shim.has_compiler(), reason="the shim is compiled with cc")
 def test_what_a_power_cut_leaves_is_resumed_to_the_same_run():
-    found = cut_all(SHORT, 40, ("strict", "names", "written"))
+    found = cut_all(SHORT, 80, ("strict", "names", "written"))
     assert found.cuts > 50 and found.trees > 50
     assert not found.failures
