@@ -25,6 +25,7 @@ A network:
   networks: a module: `mlp`, `recurrent`, and `from_linen` for any Flax module.
 
 Other:
+  adapters: a package: our environments for Gymnasium and dm_env; brax's and Playground's for us.
   exact: a package: programs of MJX with their sums in a fixed order, without the trainer.
   Array, PyTree: for type annotations.
   UserError, RunError, StoppedError: a wrong call; a run that cannot go on; one that was stopped.
@@ -38,8 +39,9 @@ import sys
 from typing import Any
 
 __version__ = "0.1.0"
-# Module -> its public names, as in `__init__.pyi`; `exact`, `lookup` and `networks` are modules.
+# Module -> its public names, as in `__init__.pyi`; adapters, exact, lookup, networks are modules.
 _NAMES = {
+    "adapters": "adapters",
     "core.env": "Env EnvError State",
     "core.errors": "RunError StoppedError UserError",
     "core.records": "Array Network Normal PolicyOutput PyTree",

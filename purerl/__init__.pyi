@@ -1,5 +1,5 @@
 # The names of `__init__.py`, for editors and type checkers; a test compares the two.
-from purerl import exact as exact
+from purerl import adapters as adapters, exact as exact
 from purerl.core.env import Env as Env, EnvError as EnvError, State as State
 from purerl.core.errors import (
     RunError as RunError,

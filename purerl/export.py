@@ -50,7 +50,7 @@ def command(options: Options) -> None:
     if not os.access(place, os.W_OK) or file.is_dir():
         raise UserError(f"{file} cannot be written: is {place} a folder of yours?")
     write = writer(options.format)
-    run = load(options.run, options.checkpoint, options.engine)
+    run = load(options.run, options.checkpoint, options.engine, options.trust)
     policy = write(run, file)
     print(record_episodes(run, options.seed).compare(policy))
     print(f"{file} ({file.stat().st_size:,} bytes)")

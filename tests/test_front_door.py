@@ -18,10 +18,10 @@ ROOT = Path(__file__).parent.parent
 NAMES = [
     "Array", "Config", "Env", "EnvError", "Evaluation", "Experiment", "Network", "Normal",
     "Physics", "PhysicsState", "Policy", "PolicyOutput", "PyTree", "Run", "RunError", "State",
-    "StoppedError", "UserError", "check_env", "choose_engine", "exact", "find", "load", "lookup",
-    "networks", "overflow_metric", "overflow_reading", "train",
+    "StoppedError", "UserError", "adapters", "check_env", "choose_engine", "exact", "find",
+    "load", "lookup", "networks", "overflow_metric", "overflow_reading", "train",
 ]  # fmt: skip
-MODULES = {"exact", "lookup", "networks"}
+MODULES = {"adapters", "exact", "lookup", "networks"}
 # They measure the insides.
 INSIDERS = {"benchmarks", "peers"}
 

@@ -1,0 +1,157 @@
+"""Our environments as `gymnasium.Env` and `gymnasium.vector.VectorEnv`."""
+
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from purerl.adapters.stepping import Picture, check_length, example, sound_step, to_numpy
+from purerl.core.env import Env, State
+from purerl.core.records import Array, PyTree
+
+
+def spaces(env: Env) -> tuple[gymnasium.Space, gymnasium.Space]:
+    """Returns the spaces of one observation (a Box, or a Dict of them) and one action."""
+
+    def box(x: Any) -> gymnasium.Space:
+        return gymnasium.spaces.Box(-np.inf, np.inf, x.shape, np.float32)
+
+    seen = example(env).observation
+    parts = {k: box(x) for k, x in seen.items()} if isinstance(seen, dict) else None
+    action = gymnasium.spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)
+    return gymnasium.spaces.Dict(parts) if parts else box(seen), action
+
+
+def new_key(rng: np.random.Generator) -> Array:
+    """Returns a JAX key drawn from Gymnasium's generator."""
+    return jax.random.key(int(rng.integers(2**32)))
+
+
+class GymnasiumEnv(gymnasium.Env):
+    """One of our environments; `gymnasium_env` makes one."""
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}
+
+    def __init__(self, env: Env, episode_length: int, render_mode: str | None) -> None:
+        """Compiles nothing yet."""
+        self.env, self.episode_length = env, check_length(episode_length)
+        self.observation_space, self.action_space = spaces(env)
+        self.metadata = self.metadata | {"render_fps": round(1 / env.control_timestep)}
+        self.render_mode = render_mode
+        self.picture = Picture(env) if render_mode else None
+        self._reset, self._step = jax.jit(env.reset), jax.jit(sound_step(env))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Starts an episode; the same seed starts the same."""
+        super().reset(seed=seed)
+        self.state, self.steps = self._reset(new_key(self.np_random)), 0
+        return to_numpy(self.state.observation), _info(self.state)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Advances one control step; action [A] in [-1, 1]."""
+        self.state, lost = self._step(self.state, np.asarray(action, np.float32))
+        self.steps += 1
+        state = self.state
+        terminated = bool(state.terminated)
+        truncated = bool(state.truncated) or (self.steps >= self.episode_length and not terminated)
+        info = _info(state) | {"lost": bool(lost)}
+        return to_numpy(state.observation), float(state.reward), terminated, truncated, info
+
+    def render(self) -> Any:
+        """Returns the picture, uint8 [H, W, 3]; None without a render mode."""
+        return self.picture.draw(self.state.physics) if self.picture else None
+
+    def close(self) -> None:
+        """Frees what OpenGL holds."""
+        if self.picture:
+            self.picture.close()
+
+
+def _info(state: State) -> dict[str, Any]:
+    return {name: float(x) for name, x in state.metrics.items()}
+
+
+def gymnasium_env(
+    env: Env, episode_length: int = 1000, render_mode: str | None = None
+) -> GymnasiumEnv:
+    """Returns one of our environments as a `gymnasium.Env`.
+
+    Args:
+      env: the environment.
+      episode_length: control steps until it is truncated.
+      render_mode: None or "rgb_array".
+
+    Raises:
+      UserError: no steps, or nothing to draw.
+    """
+    return GymnasiumEnv(env, episode_length, render_mode)
+
+
+class GymnasiumVectorEnv(VectorEnv):
+    """Several of our environments in one program; `gymnasium_vector_env` makes one."""
+
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}
+
+    def __init__(self, env: Env, number: int, episode_length: int) -> None:
+        """Compiles nothing yet."""
+        self.num_envs, self.episode_length = number, check_length(episode_length)
+        self.single_observation_space, self.single_action_space = spaces(env)
+        self.observation_space = batch_space(self.single_observation_space, number)
+        self.action_space = batch_space(self.single_action_space, number)
+        self._start = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, number)))
+        self._step = jax.jit(jax.vmap(sound_step(env)))
+        self._replace = jax.jit(_replace)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Starts all episodes."""
+        super().reset(seed=seed)
+        self.state = self._start(new_key(self.np_random))
+        self.steps = np.zeros(self.num_envs, int)
+        self.over = np.zeros(self.num_envs, bool)
+        return to_numpy(self.state.observation), self._infos(self.over)
+
+    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Advances all [B]; those that ended in the step before begin anew, and are not stepped."""
+        begun = self.over
+        stepped, lost = self._step(self.state, np.asarray(actions, np.float32))
+        if begun.any():
+            fresh = self._start(new_key(self.np_random))
+            stepped = self._replace(begun, fresh, stepped)
+        self.state = stepped
+        self.steps = np.where(begun, 0, self.steps + 1)
+        terminated = np.array(stepped.terminated)
+        truncated = np.array(stepped.truncated) | (self.steps >= self.episode_length)
+        truncated &= ~terminated
+        self.over = terminated | truncated
+        reward = np.where(begun, 0.0, np.asarray(stepped.reward))
+        infos = self._infos(np.asarray(lost) & ~begun)
+        return to_numpy(stepped.observation), reward, terminated, truncated, infos
+
+    def _infos(self, lost: np.ndarray) -> dict[str, Any]:
+        return to_numpy(self.state.metrics) | {"lost": lost}
+
+
+def _replace(condition: Array, new: PyTree, old: PyTree) -> PyTree:
+    def one(a: Array, b: Array) -> Array:
+        return jnp.where(jnp.expand_dims(condition, tuple(range(1, b.ndim))), a, b)
+
+    return jax.tree.map(one, new, old)
+
+
+def gymnasium_vector_env(env: Env, number: int, episode_length: int = 1000) -> GymnasiumVectorEnv:
+    """Returns environments as a `gymnasium.vector.VectorEnv`, stepped together by one program.
+
+    Args:
+      env: the environment.
+      number: B.
+      episode_length: control steps until one is truncated.
+    """
+    return GymnasiumVectorEnv(env, number, episode_length)

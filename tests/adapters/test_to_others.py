@@ -1,0 +1,172 @@
+"""Our environments as Gymnasium's and dm_env's."""
+
+import dataclasses
+import unittest
+import warnings
+
+import dm_env
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from dm_env import test_utils
+
+import purerl
+from envs import cartpole_swingup, run
+from purerl import adapters
+from tests.golden import privileged
+
+
+def cartpole():
+    return cartpole_swingup.build(cartpole_swingup.Options(), "c")
+
+
+def ant():
+    return run.build(run.Options(body="ant"), "c")
+
+
+def two_parts():
+    return privileged.build_env(cartpole_swingup.Options(), "c")
+
+
+ENVS = {"cartpole": cartpole, "ant": ant, "dict": two_parts}
+
+
+@dataclasses.dataclass(frozen=True)
+class Toy:
+    """Counts steps; ends at 3, or is lost at 2 after an action below -0.5."""
+
+    action_size = 1
+    control_timestep = 0.1
+
+    def reset(self, key):
+        return self.state(jax.random.uniform(key, (1,)), jnp.zeros(()), jnp.zeros(()))
+
+    def step(self, state, action):
+        count = state.physics + 1
+        bad = (action[0] < -0.5) & (count == 2)
+        seen = jnp.where(bad, jnp.nan, state.observation + 1)
+        return self.state(seen, count, jnp.where(bad, jnp.nan, action[0]))
+
+    def state(self, seen, count, reward):
+        return purerl.State(
+            physics=count,
+            observation=seen,
+            reward=reward,
+            terminated=count >= 3,
+            truncated=jnp.zeros((), bool),
+            metrics={"count": count},
+            task=(),
+        )
+
+
+@pytest.mark.parametrize("name", ENVS)
+def test_gymnasium_checks_it(name):
+    checker = pytest.importorskip("gymnasium.utils.env_checker")
+    env = adapters.gymnasium_env(ENVS[name](), episode_length=20)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # An observation of positions and speeds has no bounds, which it would rather have.
+        warnings.filterwarnings("ignore", message=".*Box observation space m..imum value is")
+        warnings.filterwarnings("ignore", message=".*spec is None|.*not having a spec")
+        checker.check_env(env, skip_render_check=True)
+
+
+def test_gymnasium_gets_what_the_environment_does():
+    pytest.importorskip("gymnasium")
+    ours, env = cartpole(), adapters.gymnasium_env(cartpole(), episode_length=3)
+    first, _ = env.reset(seed=4)
+    again, _ = env.reset(seed=4)
+    other, _ = env.reset()
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > 1e-4
+    state, step = env.state, jax.jit(ours.step)
+    for number in (1, 2, 3):
+        seen, reward, terminated, truncated, info = env.step(np.array([0.3], np.float32))
+        state = step(state, jnp.array([0.3]))
+        np.testing.assert_allclose(seen, state.observation, rtol=1e-6)
+        assert reward == pytest.approx(float(state.reward)) and not terminated
+        assert truncated == (number == 3)
+        assert info["upright"] == pytest.approx(float(state.metrics["upright"]))
+        seen[:] = 0  # the caller's own
+
+
+def test_the_end_of_a_task_is_no_time_limit_and_a_lost_simulation_is_no_nan():
+    pytest.importorskip("gymnasium")
+    env = adapters.gymnasium_env(Toy(), episode_length=3)
+    env.reset(seed=0)
+    ends = [env.step([0.5])[2:4] for _ in range(3)]
+    assert ends == [(False, False), (False, False), (True, False)]
+    env.reset(seed=0)
+    before = env.step([0.5])[0]
+    seen, reward, terminated, truncated, info = env.step([-1.0])
+    assert (reward, terminated, truncated, info["lost"]) == (0.0, False, True, True)
+    np.testing.assert_array_equal(seen, before)
+
+
+def test_a_vector_begins_anew_in_the_step_after_the_end():
+    gymnasium = pytest.importorskip("gymnasium")
+    env = adapters.gymnasium_vector_env(Toy(), 3, episode_length=5)
+    assert env.metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode.NEXT_STEP
+    first, _ = env.reset(seed=1)
+    assert len(np.unique(first)) == 3
+    actions = np.array([[0.5], [-1.0], [0.25]], np.float32)
+    rows = [env.step(actions) for _ in range(5)]
+    assert np.array([row[2] for row in rows]).T.tolist() == [
+        [False, False, True, False, False],
+        [False, False, False, False, False],
+        [False, False, True, False, False],
+    ]
+    assert np.array([row[3] for row in rows])[:, 1].tolist() == [False, True, False, False, True]
+    assert np.array([row[4]["lost"] for row in rows])[:, 1].tolist() == [
+        False, True, False, False, True,
+    ]  # fmt: skip
+    rewards = np.array([row[1] for row in rows])
+    np.testing.assert_allclose(rewards[:, 0], [0.5, 0.5, 0.5, 0.0, 0.5])
+    np.testing.assert_allclose(rewards[:, 1], [-1.0, 0.0, 0.0, -1.0, 0.0])
+    seen = np.array([row[0] for row in rows])
+    assert np.isfinite(seen).all() and (seen[3, [0, 2]] < 1).all() and (seen[2, [0, 2]] > 3).all()
+    assert env.observation_space.contains(seen[0])
+
+
+def test_a_vector_has_the_time_limit_of_each():
+    pytest.importorskip("gymnasium")
+    env = adapters.gymnasium_vector_env(cartpole(), 2, episode_length=2)
+    env.reset(seed=1)
+    actions = np.zeros((2, 1), np.float32)
+    assert [env.step(actions)[3].all() for _ in range(6)] == [False, True, False] * 2
+
+
+class TestDmEnv(test_utils.EnvironmentTestMixin, unittest.TestCase):
+    """dm_env's own tests."""
+
+    def make_object_under_test(self):
+        return adapters.dm_env_environment(cartpole(), episode_length=4)
+
+    def make_action_sequence(self):
+        for _ in range(10):
+            yield np.array([0.1], np.float32)
+
+
+def test_dm_env_tells_the_end_from_the_time_limit():
+    env = adapters.dm_env_environment(Toy(), episode_length=10, seed=3)
+    first = env.step([0.5])
+    assert first.first()
+    steps = [env.step([0.5]) for _ in range(3)]
+    assert [s.step_type for s in steps] == [dm_env.StepType.MID] * 2 + [dm_env.StepType.LAST]
+    assert [s.discount for s in steps] == [1.0, 1.0, 0.0]
+    assert env.step([0.5]).first()
+    short = adapters.dm_env_environment(Toy(), episode_length=2, seed=3)
+    np.testing.assert_array_equal(short.reset().observation, first.observation)
+    last = [short.step([0.5]) for _ in range(2)][-1]
+    assert last.last() and last.discount == 1.0
+
+
+def test_mistakes_are_one_line():
+    with pytest.raises(purerl.UserError, match="episode_length is 0"):
+        adapters.dm_env_environment(Toy(), episode_length=0)
+    with pytest.raises(AttributeError, match="has no 'gymnasium'; it has dm_env_environment, "):
+        adapters.gymnasium  # noqa: B018
+    pytest.importorskip("gymnasium")
+    with pytest.raises(purerl.UserError, match="cannot be drawn: it has no physics.model"):
+        adapters.gymnasium_env(Toy(), render_mode="rgb_array")
