@@ -4,13 +4,14 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from typing import NoReturn
 
 from purerl.core.errors import RunError, StoppedError, UserError
 from purerl.runs import output
 
-LAST_SECONDS = 15.0  # from the end of a command to that of its process
+LAST_SECONDS = 15.0  # from the end of the main thread to that of the process
 
 
 def tell(error: UserError | RunError | StoppedError) -> int:
@@ -43,11 +44,15 @@ def leave(command: Callable[[], int]) -> NoReturn:
 
 
 def end_in_time(code: int) -> None:
-    """Ends the process after some time at the latest, whatever threads of libraries still wait.
+    """Ends the process some time after its main thread, whatever threads of libraries still wait.
 
-    All that a command promises is done by now. On a disk without inodes, threads of Orbax waited
+    All that a command promises is done by then. On a disk without inodes, threads of Orbax waited
     for ever.
     """
-    timer = threading.Timer(LAST_SECONDS, os._exit, [code])
-    timer.daemon = True
-    timer.start()
+
+    def watch() -> None:
+        threading.main_thread().join()
+        time.sleep(LAST_SECONDS)
+        os._exit(code)
+
+    threading.Thread(target=watch, daemon=True).start()
