@@ -4,7 +4,7 @@ May import: core, ppo, physics. Read: `stepping.py`, then the file of the librar
 
   gymnasium_env(env), gymnasium_vector_env(env, number): for `gymnasium`.
   dm_env_environment(env): for `dm_env`.
-  from_brax(name), from_playground(name): environments of brax and MuJoCo Playground, for us.
+  from_brax(BraxOptions(name)), from_playground(PlaygroundOptions(name)): their environments for us.
 
 A name is imported when it is first used: each needs its library. docs/adapters.md shows all.
 """
@@ -16,16 +16,13 @@ HOMES = {
     "gymnasium_env": "to_gymnasium",
     "gymnasium_vector_env": "to_gymnasium",
     "dm_env_environment": "to_dm_env",
+    "BraxOptions": "brax_envs",
     "from_brax": "brax_envs",
+    "PlaygroundOptions": "playground_envs",
     "from_playground": "playground_envs",
 }
-# What a library's absence is answered with.
-_INSTALL = {
-    "gymnasium": "gymnasium",
-    "dm_env": "dm-env",
-    "brax": "brax",
-    "mujoco_playground": "playground",
-}
+# Library -> the extra that brings it.
+_EXTRAS = {"gymnasium": "gymnasium", "brax": "brax", "mujoco_playground": "playground"}
 __all__ = sorted(HOMES)
 
 
@@ -36,11 +33,12 @@ def __getattr__(name: str) -> Any:
     try:
         return getattr(importlib.import_module(f"{__name__}.{HOMES[name]}"), name)
     except ModuleNotFoundError as error:
-        package = _INSTALL.get((error.name or "").partition(".")[0])
-        if package is None:
+        extra = _EXTRAS.get((error.name or "").partition(".")[0])
+        if extra is None:
             raise
         raise ImportError(
-            f"adapters.{name} needs {package}: python -m pip install -c constraints.txt {package}"
+            f"adapters.{name} needs {error.name}: python -m pip install -c constraints.txt "
+            f"-e '.[{extra}]'"
         ) from error
 
 

@@ -4,6 +4,7 @@ import contextlib
 import os
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -11,7 +12,6 @@ from PIL import Image
 
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.keys import Purpose, derive
-from purerl.physics.interface import Physics
 from purerl.report.episode_pictures import Recording, episode_pictures, frame_stride, record
 from purerl.report.renderer import Renderer
 from purerl.runs.files import check_inside
@@ -41,8 +41,9 @@ def make_video(
       UserError: the run, the checkpoint or the camera is not one.
       RunError: there is no OpenGL, or the files cannot be written.
     """
-    physics, timestep = getattr(run.env, "physics", None), run.env.control_timestep
-    if not isinstance(physics, Physics):
+    physics: Any = getattr(run.env, "physics", None)
+    timestep = run.env.control_timestep
+    if not hasattr(physics, "model"):
         raise UserError(
             f"The environment {type(run.env).__name__} cannot be drawn: it has no `physics` of the "
             "type purerl.Physics."

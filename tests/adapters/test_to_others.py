@@ -1,8 +1,11 @@
 """Our environments as Gymnasium's and dm_env's."""
 
 import dataclasses
+import subprocess
+import sys
 import unittest
 import warnings
+from pathlib import Path
 
 import dm_env
 import jax
@@ -15,6 +18,9 @@ import purerl
 from envs import cartpole_swingup, run
 from purerl import adapters
 from tests.golden import privileged
+from tests.test_readme import PAGES, blocks
+
+ROOT = Path(__file__).parent.parent.parent
 
 
 def cartpole():
@@ -165,8 +171,74 @@ def test_dm_env_tells_the_end_from_the_time_limit():
 def test_mistakes_are_one_line():
     with pytest.raises(purerl.UserError, match="episode_length is 0"):
         adapters.dm_env_environment(Toy(), episode_length=0)
-    with pytest.raises(AttributeError, match="has no 'gymnasium'; it has dm_env_environment, "):
+    with pytest.raises(
+        AttributeError, match="has no 'gymnasium'; it has BraxOptions, .*dm_env_env"
+    ):
         adapters.gymnasium  # noqa: B018
     pytest.importorskip("gymnasium")
     with pytest.raises(purerl.UserError, match="cannot be drawn: it has no physics.model"):
         adapters.gymnasium_env(Toy(), render_mode="rgb_array")
+
+
+DRAW = """
+import os
+from purerl.report.opengl import choose_gl
+os.environ["MUJOCO_GL"] = choose_gl()
+from envs import cartpole_swingup
+from purerl import adapters
+env = adapters.gymnasium_env(cartpole_swingup.build(), render_mode="rgb_array")
+pictures = []
+for seed in (0, 0, 1):
+    env.reset(seed=seed)
+    for _ in range(20 * seed):
+        env.step([1.0])
+    pictures.append(env.render().astype(int))
+env.close()
+first, again, other = pictures
+print(first.shape, first.std() > 10, abs(first - again).max(), abs(first - other).max() > 50)
+"""
+
+
+def test_it_is_drawn():
+    pytest.importorskip("gymnasium")
+    done = subprocess.run([sys.executable, "-c", DRAW], capture_output=True, text=True, cwd=ROOT)
+    if "There is no OpenGL" in done.stderr:
+        pytest.skip("no OpenGL here")
+    assert done.stdout == "(480, 640, 3) True 0 True\n", done.stderr
+
+
+# --- the page ---
+
+PYTHON = blocks(PAGES["docs/adapters.md"].read_text(), "python")
+
+
+@pytest.mark.parametrize("library", ["gymnasium_env", "dm_env_environment"])
+def test_the_page_runs(library):
+    pytest.importorskip(library.partition("_env")[0].replace("dm", "dm_env"))
+    (block,) = [block for block in PYTHON if library in block and "baselines" not in block]
+    exec(block, {})
+
+
+@pytest.mark.parametrize(
+    ("library", "module"), [("brax", "brax"), ("playground", "mujoco_playground")]
+)
+def test_the_experiments_of_the_page_are_experiments(library, module):
+    pytest.importorskip(module)
+    (block,) = [block for block in PYTHON if f"from_{library}" in block]
+    names: dict = {}
+    exec(block, names)
+    assert isinstance(names["experiment"], purerl.Experiment)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_stable_baselines3_learns_the_cart_pole():
+    """Only where PyTorch is installed."""
+    pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common.evaluation import evaluate_policy
+
+    (block,) = [block for block in PYTHON if "baselines" in block]
+    names: dict = {}
+    exec(block.replace("80_000", "20_000"), names)
+    value, _ = evaluate_policy(names["model"], names["env"], 3, warn=False)
+    assert value > 150  # at first below 1
