@@ -172,7 +172,7 @@ def test_mistakes_are_one_line():
     with pytest.raises(purerl.UserError, match="episode_length is 0"):
         adapters.dm_env_environment(Toy(), episode_length=0)
     with pytest.raises(
-        AttributeError, match="has no 'gymnasium'; it has BraxOptions, .*dm_env_env"
+        AttributeError, match="has no 'gymnasium'; it has Brax.*, dm_env_env"
     ):
         adapters.gymnasium  # noqa: B018
     pytest.importorskip("gymnasium")
