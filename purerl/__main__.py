@@ -10,18 +10,26 @@ from purerl.runs.command_errors import leave, tell
 from purerl.runs.experiment import summary
 from purerl.runs.output import show
 
-COMMANDS = ("run", "evaluate", "render", "record", "export", "compare")
+COMMANDS = ("run", "evaluate", "render", "record", "export", "compare", "report", "plot")
+
+HERE = Path(__file__).parent
+
+
+def module_of(command: str) -> str:
+    """Returns a command's module below `purerl`: a file's, or that of a room of its name."""
+    return f"{command}.__main__" if (HERE / command).is_dir() else command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command, or prints the list of them; returns the exit code."""
     name, *rest = (sys.argv[1:] if arguments is None else list(arguments)) or [""]
     if name in COMMANDS:
-        return importlib.import_module(f"purerl.{name}").main(rest)
+        return importlib.import_module(f"purerl.{module_of(name)}").main(rest)
     if name not in ("", "-h", "--help"):
         return tell(UserError(unknown_name("command", name, COMMANDS)))
-    files = [Path(__file__).with_name(f"{command}.py") for command in COMMANDS]
-    show(*(f"{file.stem:9} {summary(file)}" for file in files))
+    for command in COMMANDS:
+        file = HERE / f"{module_of(command).replace('.', '/')}.py"
+        show(f"{command:9} {summary(file)}")
     show("", "Options of a command: python -m purerl COMMAND --help")
     return 0 if name else USAGE
 

@@ -83,6 +83,7 @@ def test_lists_and_help_pages_start_no_jax():
 
 def test_the_commands_are_listed_a_line_each_and_called(capsys, tmp_path):
     here = {path.stem for path in (ROOT / "purerl").glob("*.py")} - {"__init__", "__main__"}
+    here |= {path.parent.name for path in (ROOT / "purerl").glob("*/__main__.py")}
     assert set(commands.COMMANDS) == here
     assert commands.main(["--help"]) == 0
     lines = capsys.readouterr().out.split("\n\n")[0].splitlines()

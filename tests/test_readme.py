@@ -58,7 +58,9 @@ def help_page(*words):
     """Returns the help page of one of our commands: a module, then what has to stand first."""
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
-        importlib.import_module(words[0]).main([*words[1:], "--help"])
+        is_room = (ROOT / words[0].replace(".", "/")).is_dir()
+        module = f"{words[0]}.__main__" if is_room else words[0]
+        importlib.import_module(module).main([*words[1:], "--help"])
     return said.getvalue()
 
 
@@ -66,7 +68,7 @@ def help_page(*words):
 def all_help():
     """Returns the help pages of all our commands, those of `run` for two experiments."""
     pages = [help_page("purerl.run", name) for name in ("ant_gaps", "suite")]
-    names = ("evaluate", "render", "compare", "record", "export")
+    names = ("evaluate", "render", "compare", "record", "export", "report", "plot")
     return "".join([*pages, *(help_page(f"purerl.{name}") for name in names)])
 
 

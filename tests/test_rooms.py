@@ -23,7 +23,8 @@ MAY_IMPORT = {
     "report": {"core", "ppo", "physics", "devices", "runs"},
     "adapters": {"core", "ppo", "physics"},
 }
-COMMANDS = {"compare", "evaluate", "export", "record", "render", "run"}
+# Files beside the rooms. The command `report` is the room of that name, by its __main__.py.
+COMMANDS = {"compare", "evaluate", "export", "plot", "record", "render", "run"}
 MODULES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
     for path in HOUSE.rglob("*.py")

@@ -46,6 +46,16 @@ def compare(
       UserError: a place means no run, or there is no such metric or setting.
     """
     runs = [run_reader.read(path) for path in run_reader.find_runs(places)]
+    result, curves = compare_records(runs, metric, group_by)
+    if result["unscored"] and not result["pairs"]:  # else the bits can be compared all the same
+        raise UserError(result["unscored"])
+    return result, curves
+
+
+def compare_records(
+    runs: Sequence[run_reader.RunRecord], metric: str, group_by: Sequence[str]
+) -> tuple[dict[str, Any], list[Curve]]:
+    """Compares runs that were read, as `compare`; "unscored" says why there are no scores."""
     first: dict[str, run_reader.RunRecord] = {}
     repeats = [(first.setdefault(run.identity, run), run) for run in runs]
     pairs = [bit_diff.compare_bits(a, b) for a, b in repeats if a is not b]
@@ -54,9 +64,7 @@ def compare(
     try:
         seed_statistics.check_scored(runs, groups, metric)
     except UserError as error:
-        if not pairs:
-            raise
-        groups, unscored = [], str(error)  # the bits can be compared all the same
+        groups, unscored = [], str(error)
     conditions = [
         line for run in runs[1:] for line in manifest.differences(runs[0].manifest, run.manifest)
     ]
@@ -100,10 +108,10 @@ def describe(result: dict[str, Any]) -> list[str]:
             )
     if result["pairs"]:
         lines.append("Runs of one configuration and seed count once, as the first of them.")
-    return lines + _notes(groups)
+    return lines + notes(groups)
 
 
-def _notes(summaries: Sequence[dict[str, Any]]) -> list[str]:
+def notes(summaries: Sequence[dict[str, Any]]) -> list[str]:
     """Returns what a reader of the tables must know."""
     left_out = sum(s["unfinished"] for s in summaries)
     silent = sum(s["done"] + s["failed"] - s["n"] for s in summaries)
@@ -122,18 +130,18 @@ def _notes(summaries: Sequence[dict[str, Any]]) -> list[str]:
 def _table(columns: Sequence[tuple[str, str]], records: Iterable[dict[str, Any]]) -> list[str]:
     """Returns a table's lines, its head first; the first column is flush left, others right."""
     rows = [[head for head, _ in columns]]
-    rows += [[_cell(record[key]) for _, key in columns] for record in records]
+    rows += [[cell(record[key]) for _, key in columns] for record in records]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     form = "  ".join(f"{{:{'>' if i else '<'}{width}}}" for i, width in enumerate(widths))
     return [form.format(*row).rstrip() for row in rows]
 
 
-def _cell(value: Any) -> str:
+def cell(value: Any) -> str:
     """Returns a number with four significant digits (whole where it is large), or [low, high]."""
     if value is None:
         return "-"
     if isinstance(value, dict):
-        return f"[{_cell(value['low'])}, {_cell(value['high'])}]"
+        return f"[{cell(value['low'])}, {cell(value['high'])}]"
     if isinstance(value, float):
         return f"{value:,.0f}" if abs(value) >= 10_000 else f"{value:.4g}"
     return str(value)
@@ -157,7 +165,7 @@ def write(folder: Path, result: dict[str, Any], curves: Sequence[Curve]) -> None
         _write_csv(folder / "groups.csv", GROUPS_CSV, groups)
         _write_csv(folder / "curves.csv", CURVES_CSV, _curve_rows(curves))
         if curves:
-            _plot(folder / "curves.png", curves, result["metric"])
+            draw_curves(folder / "curves.png", curves, result["metric"])
     except OSError as error:
         raise UserError(f"{folder} cannot be written: {error.strerror}.") from error
 
@@ -177,8 +185,8 @@ def _write_csv(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]
         writer.writerows(rows)
 
 
-def _plot(path: Path, curves: Iterable[Curve], metric: str) -> None:
-    """Draws each group's IQM, its band, and its runs as thin lines."""
+def draw_curves(path: Path, curves: Iterable[Curve], metric: str) -> None:
+    """Writes a picture of each group's IQM, its band, and its runs as thin lines."""
     import matplotlib  # most of a second
 
     matplotlib.use("Agg")

@@ -180,3 +180,11 @@ def learning_curve(group: Group, metric: str) -> Curve | None:
         return None
     values = [np.array([[curve[s] for s in steps] for curve in curves]) for curves in strata]
     return Curve(group.label, steps, bootstrap.curve_band(values), runs)
+
+
+def every_curve(group: Group, metric: str) -> Curve:
+    """Returns a group's curve with all its runs, also those that do not count in a score."""
+    counted = learning_curve(group, metric)
+    runs = [curve for run in group.runs if (curve := run.curve(metric))]
+    none = Curve(group.label, [], bootstrap.Band(np.array([]), None, None), [])
+    return (counted or none)._replace(runs=runs)

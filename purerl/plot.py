@@ -1,0 +1,63 @@
+"""Plots a metric of runs: `python -m purerl.plot RUN ... [--metric M] [--out F.png]`.
+
+In the terminal, as wide as that is, by plain characters; with --out also as a picture.
+"""
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from purerl.core.errors import UserError
+from purerl.runs.command_errors import leave
+from purerl.runs.command_line import carry_out
+from purerl.runs.output import show
+
+
+@dataclass(frozen=True)
+class Options:
+    """Plots a metric of runs in the terminal, and as a PNG."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Runs, folders of runs (runs/ant_run), or patterns ('runs/ant_run/wide*')."""
+    metric: str = "eval/episode_return"
+    """What to plot, against control steps."""
+    out: Path | None = None
+    """Also write a picture (PNG): groups as in compare, their interquartile means, their runs."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    return carry_out(Options, command, "python -m purerl.plot", arguments)
+
+
+def command(options: Options) -> None:
+    """Prints the curve, and writes the picture that was asked for."""
+    from purerl.report import comparison
+    from purerl.report.run_reader import find_runs, read
+    from purerl.report.seed_statistics import every_curve, make_groups
+    from purerl.report.terminal_plot import check_plotted, draw
+
+    if not options.runs:
+        raise UserError("Give the runs to plot: python -m purerl.plot RUN RUN ...")
+    if options.out is not None and options.out.suffix != ".png":
+        raise UserError(f"out is {options.out}; it must end in .png.")
+    runs = [read(path) for path in find_runs(options.runs)]
+    groups = make_groups(runs, ())
+    check_plotted(runs, options.metric)
+    curves = [every_curve(group, options.metric) for group in groups]
+    columns, rows = shutil.get_terminal_size((100, 30))
+    show(*draw(curves, options.metric, columns, min(rows - 6, 24)))
+    if options.out is not None:
+        try:
+            comparison.draw_curves(options.out, curves, options.metric)
+        except OSError as error:
+            raise UserError(f"{options.out} cannot be written: {error.strerror}.") from error
+        show(str(options.out))
+
+
+if __name__ == "__main__":
+    leave(main)

@@ -1,0 +1,55 @@
+"""Makes a page about runs: `python -m purerl.report RUN ... [--out report.html]`.
+
+One HTML file: curves, every metric, evaluations, settings, videos. It needs no network, and any
+browser opens it; hover for values. Nothing of the runs is executed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from purerl.core.errors import UserError
+from purerl.runs.command_errors import leave
+from purerl.runs.command_line import carry_out
+from purerl.runs.output import show
+
+
+@dataclass(frozen=True)
+class Options:
+    """Makes one HTML file about runs: curves, every metric, evaluations, settings, videos."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Runs, folders of runs (runs/ant_run), or patterns ('runs/ant_run/wide*')."""
+    out: Path = Path("report.html")
+    """The file to write."""
+    group_by: tuple[str, ...] = ()
+    """Settings that make a group, such as ppo.learning_rate; by default all in which the runs
+    differ, but the seed."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    return carry_out(Options, command, "python -m purerl.report", arguments)
+
+
+def command(options: Options) -> None:
+    """Writes the page, and prints where it is."""
+    from purerl.report.page import make_page
+    from purerl.report.run_reader import find_runs, read
+    from purerl.runs.files import write_file
+
+    if not options.runs:
+        raise UserError("Give the runs to report: python -m purerl.report RUN RUN ...")
+    if options.out.is_dir():
+        raise UserError(f"{options.out} is a folder: give a file, as --out {options.out}/a.html.")
+    runs = [read(path) for path in find_runs(options.runs)]
+    page = make_page(runs, options.group_by).encode()
+    write_file(options.out, page)
+    show(f"{options.out} ({len(runs)} runs, {len(page):,} bytes): open it in a browser")
+
+
+if __name__ == "__main__":
+    leave(main)

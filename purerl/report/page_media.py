@@ -1,0 +1,79 @@
+"""A run's videos and contact sheets, read with care and made part of a page.
+
+A page is sent to others. So what stands in it is only what a run's folder itself holds: a link in a
+stranger's folder does not put a file of the reader into it.
+"""
+
+import base64
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+from purerl.core.errors import UserError
+from purerl.report.html_elements import Html, element
+from purerl.runs.files import check_inside, read_bytes
+
+LARGEST = 32 << 20  # [bytes] of a file
+LARGEST_PAGE = 64 << 20  # [bytes] of all files of a page
+# By suffix: the kind, where its signature stands, and the signature.
+KINDS = {".mp4": ("video/mp4", 4, b"ftyp"), ".png": ("image/png", 0, b"\x89PNG\r\n\x1a\n")}
+
+
+class Media(NamedTuple):
+    """A run's pictures, or why there are none."""
+
+    files: dict[str, dict[str, bytes]]  # name without suffix -> suffix -> content
+    left_out: list[str]  # a line for each
+
+
+def read_media(folder: Path, room: int) -> Media:
+    """Reads a run's videos and sheets, newest first.
+
+    Args:
+      folder: the run's.
+      room: how many bytes the page still takes.
+    """
+    found = Media({}, [])
+    names = (folder / "videos").glob("[!.]*.*")
+    for path in sorted(names, key=lambda path: (path.stem, path.suffix), reverse=True):
+        if path.suffix in KINDS:
+            try:
+                content = _read(folder, path, min(room, LARGEST))
+            except UserError as error:
+                found.left_out.append(str(error))
+                continue
+            room -= len(content)
+            found.files.setdefault(path.stem, {})[path.suffix] = content
+    return found
+
+
+def _read(folder: Path, path: Path, largest: int) -> bytes:
+    """Reads a file; UserError unless it is the folder's own, not too large, and what it says."""
+    check_inside(folder, path)
+    content = read_bytes(path, largest)
+    kind, start, signature = KINDS[path.suffix]
+    if content[start : start + len(signature)] != signature:
+        raise UserError(f"{path} is no {kind}: its first bytes are others.")
+    return content
+
+
+def size(media: Iterable[Media]) -> int:
+    """Returns how many bytes the files have."""
+    return sum(len(c) for one in media for files in one.files.values() for c in files.values())
+
+
+def media_elements(title: str, media: Media) -> list[Html]:
+    """Returns a run's videos, each over its sheet, and what was left out."""
+    parts = []
+    for name, files in media.files.items():
+        inside = [_element(suffix, files[suffix], f"{title}, {name}") for suffix in sorted(files)]
+        caption = element("figcaption", f"{title}: {name}")
+        parts.append(element("figure", caption, *inside, class_="media"))
+    return parts + [element("p", f"Left out: {line}", class_="note") for line in media.left_out]
+
+
+def _element(suffix: str, content: bytes, about: str) -> Html:
+    source = f"data:{KINDS[suffix][0]};base64,{base64.b64encode(content).decode()}"
+    if suffix == ".mp4":
+        return element("video", src=source, controls=True, loop=True, muted=True, aria_label=about)
+    return element("img", src=source, alt=f"Moments of {about}")
