@@ -46,6 +46,7 @@ class MetricsFile:
                 "keeps its whole lines."
             )
         self.file.truncate(offset)
+        os.fsync(self.file.fileno())
         self.offset = offset
         self.pending = b""
 

@@ -13,6 +13,7 @@ their file, names after fsync of their folder. What is not promised may be there
 
 from __future__ import annotations
 
+import os
 from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -219,7 +220,8 @@ def _bytes_left(file: _File, model: str) -> bytes:
     data, promised = file.data, file.promised
     if model == "written" or data == promised:
         return data
-    kept = promised if data.startswith(promised) else b""  # it grew, or it was written over
+    # What both begin with is in the file, whichever of them is: it grew, or was cut and grew again.
+    kept = os.path.commonprefix([promised, data])
     if model == "torn":
         return data[: (len(kept) + len(data)) // 2]
     if model == "zeros":
