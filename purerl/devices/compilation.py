@@ -1,6 +1,7 @@
 """How programs are compiled: the cache, levels of optimisation, side by side in threads."""
 
 import contextlib
+import functools
 import gc
 import os
 import time
@@ -12,8 +13,10 @@ from typing import Any, NamedTuple
 import jax
 
 from purerl import exact
+from purerl.core.errors import UserError
 from purerl.core.records import Metrics, PyTree
 from purerl.devices import compile_cache
+from purerl.exact.portable import LibraryError
 
 # Up to so many cores, the evaluation is compiled when it is first needed, or the first update
 # would wait for it. With 16 cores all is compiled side by side: brax's ant came to its first
@@ -90,9 +93,26 @@ def jit(name: str, function: Callable, **options: Any) -> Any:
 
     At another level its bits are others.
     """
+    function = portable(function)
     on_cpu = name in LEVELS and jax.default_backend() == "cpu"
     level = {"xla_backend_optimization_level": LEVELS[name]} if on_cpu else None
     return jax.jit(function, compiler_options=level, **options)
+
+
+def portable(function: Callable) -> Callable:
+    """Returns a program as it is, or in a portable run one that calls no library."""
+    if not exact.is_portable():
+        return function
+    own = exact.without_libraries(function)
+
+    @functools.wraps(own)
+    def traced(*arguments: Any) -> Any:
+        try:
+            return own(*arguments)
+        except LibraryError as error:
+            raise UserError(f"{error} Leave out --portable, or that.") from error
+
+    return traced
 
 
 def start(name: str, traced: Any, seconds: dict[str, float]) -> Future[Any]:

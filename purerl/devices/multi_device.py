@@ -21,7 +21,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDev
 from purerl import exact
 from purerl.core.env import Env
 from purerl.core.records import Array, Metrics, Network, PyTree, TrainState
-from purerl.devices.compilation import Compiling, shapes, start, unordered
+from purerl.devices.compilation import Compiling, portable, shapes, start, unordered
 from purerl.devices.shards import AXIS, Shards, parts_of
 from purerl.devices.slices import count_slices, cut_in_slices
 from purerl.ppo import algorithm
@@ -209,7 +209,7 @@ def compile_update(
     collects, experience, sums = compile_collects(layout, config, env, network, abstract)
     improving = jax.jit(
         jax.shard_map(
-            functools.partial(improve, config, network, shards),
+            portable(functools.partial(improve, config, network, shards)),
             mesh=mesh, in_specs=(SAME, SPLIT), out_specs=SAME, check_vma=False,
         ),
         compiler_options=exact.equal_passes(),
@@ -244,7 +244,7 @@ def compile_collects(
     layout: Layout, config: Config, env: Env, network: Network, abstract: TrainState
 ) -> tuple[list[Callable], PyTree, list[str]]:
     """Compiles `collect` for each device here; returns also its result's shapes, its loose sums."""
-    program = jax.jit(functools.partial(collect, config, env, network), donate_argnums=1)
+    program = jax.jit(portable(functools.partial(collect, config, env, network)), donate_argnums=1)
     learned = abstract.replace(**dict.fromkeys(PLACES))
     places = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct((layout.size, *x.shape[1:]), x.dtype),

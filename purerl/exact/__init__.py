@@ -5,7 +5,7 @@ It serves anybody with plain MJX: `exact.rewrite(mjx.step)`; see docs/exact.md.
 What belongs here: code that rewrites a traced function, and the choices of XLA that change bits.
 May import: nothing. Read: `rewriting.py` (the public function), `walk.py` (how a trace is run again
 with equations replaced), then the two sets of rules: `order.py` with `scatters.py`, the promise,
-and `fuse.py`, the optimisation. `xla_flags.py` stands alone.
+and `fuse.py`, the optimisation. `portable.py` has the rules for a CPU. `xla_flags.py` stands alone.
 """
 
 import importlib
@@ -14,7 +14,8 @@ from typing import Any
 # Imported when they are asked for: `set_xla_flags` has to be called before JAX starts.
 _PUBLIC = dict.fromkeys(("unordered_sums", "unordered_in", "ScatterSum"), "order")
 _PUBLIC |= dict.fromkeys(("set_xla_flags", "how_chosen", "equal_passes"), "xla_flags")
-_PUBLIC["rewrite"] = "rewriting"
+_PUBLIC |= dict.fromkeys(("set_portable_flags", "is_portable"), "xla_flags")
+_PUBLIC |= {"rewrite": "rewriting", "without_libraries": "portable"}
 __all__ = sorted(_PUBLIC)
 
 

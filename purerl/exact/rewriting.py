@@ -28,7 +28,20 @@ def rewrite(f: Callable, *, platform: str | None = None, fuse: bool = True) -> C
       RuntimeError: when it is traced, if the order of a sum cannot be fixed.
     """
 
-    @functools.wraps(f)
+    def in_order(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
+        rules = optimisation.rules(platform or jax.default_backend()) if fuse else []
+        return order.check_ordered(rewrite_trace(closed, [order.RULE, *rules]))
+
+    return jax.jit(traced_anew(f, in_order), inline=True)
+
+
+def traced_anew(f: Callable, change: Callable[[core.ClosedJaxpr], core.ClosedJaxpr]) -> Callable:
+    """Returns a function that traces `f` when it is called, and runs the trace that `change` gives.
+
+    `f` is a pure function of pytrees of arrays.
+    """
+
+    @functools.wraps(f.func if isinstance(f, functools.partial) else f)
     def rewritten(*args: Any, **kwargs: Any) -> Any:
         leaves, tree = jax.tree.flatten((args, kwargs))
 
@@ -37,9 +50,7 @@ def rewrite(f: Callable, *, platform: str | None = None, fuse: bool = True) -> C
             return f(*args, **kwargs)
 
         closed, shapes = jax.make_jaxpr(flat, return_shape=True)(*leaves)
-        rules = optimisation.rules(platform or jax.default_backend()) if fuse else []
-        closed = order.check_ordered(rewrite_trace(closed, [order.RULE, *rules]))
-        results = core.jaxpr_as_fun(closed)(*leaves)
+        results = core.jaxpr_as_fun(change(closed))(*leaves)
         return jax.tree.unflatten(jax.tree.structure(shapes), results)
 
-    return jax.jit(rewritten, inline=True)
+    return rewritten

@@ -93,8 +93,8 @@ def _apply(
         return with_own_derivative(eqn, functools.partial(_call, eqn, inputs, inside), inputs)
     if name in CALLS:
         return inside(sub_jaxprs(eqn)[0], *inputs)
-    if name in _LOOPS:
-        return _LOOPS[name](eqn.params, inputs, inside)
+    if name in LOOPS:
+        return LOOPS[name](eqn.params, inputs, inside)
     return bind_equation(eqn, *inputs)
 
 
@@ -141,8 +141,21 @@ def while_parts(params: dict, inputs: Sequence, inside: Inside) -> tuple[Callabl
 
 
 def _while(params: dict, inputs: Sequence, inside: Inside) -> list:
-    """`lax.while_loop` with a rewritten condition and body."""
-    return lax.while_loop(*while_parts(params, inputs, inside))
+    """`lax.while_loop` with a rewritten condition and body.
+
+    Of a vmapped loop the condition is not [], and a loop that is over waits for the others.
+    """
+    condition, body, start = while_parts(params, inputs, inside)
+    if not params["cond_jaxpr"].out_avals[0].shape:
+        return lax.while_loop(condition, body, start)
+
+    def step(carry):
+        going = condition(carry)
+        pairs = zip(body(carry), carry, strict=True)
+        axes = lambda x: tuple(range(going.ndim, x.ndim))  # noqa: E731
+        return [jnp.where(jnp.expand_dims(going, axes(y)), x, y) for x, y in pairs]
+
+    return lax.while_loop(lambda carry: condition(carry).any(), step, start)
 
 
 def _cond(params: dict, inputs: Sequence, inside: Inside) -> list:
@@ -151,4 +164,4 @@ def _cond(params: dict, inputs: Sequence, inside: Inside) -> list:
     return lax.switch(jnp.asarray(inputs[0], jnp.int32), branches)
 
 
-_LOOPS = {"scan": scan, "while": _while, "cond": _cond}
+LOOPS = {"scan": scan, "while": _while, "cond": _cond}

@@ -33,6 +33,18 @@ FIXING_FLAGS = (
     "xla_gpu_deterministic_ops=true",
     "xla_gpu_exclude_nondeterministic_ops=true",
 )
+# On a CPU, what asks the processor what it can do, or how large its caches are, is left out:
+# instructions beyond AVX2; approximate reciprocals, which each maker rounds otherwise; YNNPACK and
+# XNNPACK. Other libraries are left out by `portable.py`.
+PORTABLE = {
+    "xla_cpu_max_isa": "AVX2",
+    "xla_cpu_multi_thread_eigen": "false",
+    "xla_cpu_enable_platform_dependent_math": "false",
+    "xla_cpu_use_xnnpack": "false",
+    "xla_cpu_experimental_ynn_fusion_type": "-dot,-eltwise,-reduce,-individual_dot"
+    ",-individual_convolution",
+    "xla_backend_extra_options": "xla_force_enable_experimental_llvm_ir_gemm",
+}
 # JAX keeps the timings of earlier processes beside its own cache, and XLA reads them there.
 KEPT_TIMINGS = "JAX_PERSISTENT_CACHE_ENABLE_XLA_CACHES"
 
@@ -48,6 +60,33 @@ def set_xla_flags() -> None:
         os.environ.setdefault(KEPT_TIMINGS, "none")
     added = [f"--{name}={value}" for name, value in wanted.items() if name not in flags]
     os.environ["XLA_FLAGS"] = " ".join([flags, *added]).strip()
+
+
+def set_portable_flags() -> None:
+    """Sets in the environment what makes a CPU's bits those of every x86-64 processor with AVX2.
+
+    To be called before JAX starts. Only programs `without_libraries` have them.
+
+    Raises:
+      ValueError: XLA_FLAGS says otherwise.
+    """
+    flags = os.environ.get("XLA_FLAGS", "").split()
+    for name, value in PORTABLE.items():
+        wanted = f"--{name}={value}"
+        users = [flag for flag in flags if flag.partition("=")[0] == f"--{name}"]
+        if any(flag != wanted for flag in users):
+            raise ValueError(
+                f"XLA_FLAGS has {users[0]}; portable bits need {wanted}: leave it out."
+            )
+        flags += [] if users else [wanted]
+    os.environ |= {"XLA_FLAGS": " ".join(flags), "NPROC": "1"}
+
+
+def is_portable() -> bool:
+    """Tells whether the environment is as `set_portable_flags` makes it."""
+    flags = os.environ.get("XLA_FLAGS", "").split()
+    one_thread = os.environ.get("NPROC") == "1"
+    return one_thread and all(f"--{name}={value}" in flags for name, value in PORTABLE.items())
 
 
 def how_chosen(platform: str) -> str:

@@ -13,6 +13,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from purerl import exact
+from purerl.core.errors import UserError
+from purerl.runs.files import read_json
 from purerl.runs.source_hashes import source_hashes
 
 PACKAGES = ["jax", "jaxlib", "mujoco", "mujoco-mjx", "dm-control", "flax", "optax", "numpy"]
@@ -22,6 +25,7 @@ INFORMATIVE |= {"devices"}  # how many share the shards
 # What these follow from is compared itself.
 INFORMATIVE |= {"experiment_file", "bit_exact", "inexact_because"}
 FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE", "JAX_PLATFORMS", "JAX_ENABLE_X64")
+PORTABLE = "x86-64 with AVX2, portable"  # instead of a processor's model
 
 
 def collect(
@@ -45,7 +49,8 @@ def collect(
     options = jax.config.values
     return (
         {
-            "versions": {"python": platform.python_version()} | {p: _version(p) for p in packages},
+            "versions": {"python": platform.python_version(), "libc": "-".join(platform.libc_ver())}
+            | {p: _version(p) for p in packages},
             "device": about,
             "num_shards": num_shards,
             "devices": jax.device_count() if num_shards > 1 else 1,
@@ -85,6 +90,8 @@ def exactness(engine: str, kernels: str, unordered: Iterable[str] = ()) -> dict[
 def _flags() -> dict[str, str]:
     """Returns the environment variables that bits depend on, without what says how many devices."""
     found = {name: os.environ[name] for name in FLAGS if name in os.environ}
+    if exact.is_portable():
+        found.pop("JAX_PLATFORMS", None)  # a machine with a GPU needs it, another one does not
     if "XLA_FLAGS" in found:
         words = found["XLA_FLAGS"].split()
         found["XLA_FLAGS"] = " ".join(w for w in words if "platform_device_count" not in w)
@@ -123,11 +130,29 @@ def _version(package: str) -> str:
 
 def _device_kind(device: Any) -> str:
     """Returns the device's model; for a CPU the processor's, since kernels are chosen by it."""
+    portable = exact.is_portable()
     if device.platform != "cpu":
+        if portable:
+            raise UserError(
+                f"Portable bits are a CPU's, and JAX computes on a {device.platform}; set "
+                "JAX_PLATFORMS=cpu, or leave out --portable."
+            )
         return device.device_kind
+    return PORTABLE if portable else processor("model name") or platform.machine()
+
+
+def processor(what: str) -> str:
+    """Returns what Linux says of the processor, "" if it says nothing."""
     lines = Path("/proc/cpuinfo").read_text().splitlines()
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(what)), "")
+
+
+def was_portable(folder: Path) -> bool:
+    """Tells whether a run was begun with portable bits."""
+    try:
+        return read_json(folder / "manifest.json")["device"]["kind"] == PORTABLE
+    except (OSError, LookupError, TypeError, ValueError, UserError):
+        return False  # whoever needs the file says what is wrong with it
 
 
 def _git(folder: Path) -> dict[str, Any]:

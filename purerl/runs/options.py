@@ -40,6 +40,8 @@ class Options:
     distributed: str = ""
     """One of several processes that train together: auto (SLURM, Open MPI, ...), or
     HOST:PORT,NUM_PROCESSES,PROCESS_ID, HOST being that of process 0, which alone writes the run."""
+    portable: bool = False
+    """On a CPU: the same bits on every x86-64 processor with AVX2, at some cost in speed."""
     resume: bool = False
     """Go on from the last whole checkpoint of the run."""
     allow_changes: bool = False

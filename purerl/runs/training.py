@@ -5,6 +5,7 @@ Nothing here imports JAX before a run begins, so that XLA's flags are set in tim
 
 import dataclasses
 import os
+import platform
 import signal
 import sys
 import threading
@@ -73,6 +74,7 @@ def train_runs(
       options: the run's options.
       end: called with an exit code at the second signal.
     """
+    from purerl.runs import manifest
     from purerl.runs.session import execute
 
     place, runs = options.runs / source.name, {}
@@ -81,6 +83,8 @@ def train_runs(
         if options.num_seeds > 1 and options.name:
             name += f"-seed{seed}"
         runs[place / name] = dataclasses.replace(chosen, seed=seed)
+    if options.portable or (options.resume and any(map(manifest.was_portable, runs))):
+        set_portable_flags_in_time()
     with stop_signals(end) as stop:
         execute(source, runs, options, stop)
     return list(runs)
@@ -103,13 +107,36 @@ def set_xla_flags_in_time() -> None:
         sys.modules["jax"].config.update(xla_flags.KEPT_TIMINGS.lower(), kept)
 
 
-def _runs_on_gpu() -> bool:
-    jax = sys.modules.get("jax")
-    if jax is None:
+def set_portable_flags_in_time() -> None:
+    """Sets what makes bits portable; UserError where this processor or process cannot have them."""
+    from purerl.runs.manifest import processor
+
+    if not {"avx2", "fma"} <= set(processor("flags").split()):
+        raise UserError(
+            "Portable bits are those of x86-64 processors with AVX2 and FMA, and this one "
+            f"({processor('model name') or platform.machine()}) has not both; leave out --portable."
+        )
+    if _jax_has_begun() and not xla_flags.is_portable():
+        raise UserError(
+            "JAX has begun with other flags than portable bits need: begin a new process, or call "
+            "purerl.exact.set_portable_flags() before JAX's first computation."
+        )
+    try:
+        xla_flags.set_portable_flags()
+    except ValueError as error:
+        raise UserError(str(error)) from error
+
+
+def _jax_has_begun() -> bool:
+    if "jax" not in sys.modules:
         return False
     from jax._src import xla_bridge  # JAX has no public way to ask without starting it
 
-    return xla_bridge.backends_are_initialized() and jax.default_backend() == "gpu"
+    return xla_bridge.backends_are_initialized()
+
+
+def _runs_on_gpu() -> bool:
+    return _jax_has_begun() and sys.modules["jax"].default_backend() == "gpu"
 
 
 @contextmanager
