@@ -3,5 +3,5 @@
 python -m tests.golden            # compute them, compare them with digests.json
 python -m tests.golden --write    # put them there: after a change of bits that CHANGELOG names
 
-XLA computes with one thread and with AVX2, which every x86-64 processor of the last ten years has.
+The runs are `--portable`: every x86-64 processor of the last ten years has these bits.
 """
