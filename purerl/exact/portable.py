@@ -18,7 +18,7 @@ from purerl.exact.rewriting import traced_anew
 from purerl.exact.traces import CALLS, source, sub_jaxprs
 from purerl.exact.walk import LOOPS, Inside, Rule, rewrite_trace
 
-LAPACK = {"lu", "qr", "geqrf", "geqp3", "householder_product", "ormqr", "eig", "eigh", "svd"}
+LAPACK = {"lu", "geqrf", "geqp3", "householder_product", "ormqr", "eig", "eigh", "svd"}
 LAPACK |= {"schur", "sylvester", "hessenberg", "tridiagonal", "tridiagonal_solve"}
 
 
@@ -116,14 +116,43 @@ def solution(params: dict, matrix: Array, sides: Array) -> Array:
     return found if params["left_side"] else jnp.swapaxes(found, -1, -2)
 
 
-REPLACED = {"dot_general": product, "cholesky": factor, "triangular_solve": solution}
+def reflections(params: dict, matrix: Array) -> tuple[Array, Array]:
+    """Computes a `qr` [..., m, n] by Householder's reflections, with the signs of LAPACK."""
+    m, n = matrix.shape[-2:]
+    row, eye = jnp.arange(m)[:, None], jnp.eye(m, dtype=matrix.dtype)
+
+    def step(k: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
+        q, r = both
+        column = lax.dynamic_index_in_dim(r, k, r.ndim - 1)
+        pivot = lax.dynamic_index_in_dim(column, k, r.ndim - 2)
+        below = jnp.sum(jnp.where(row > k, column * column, 0.0), -2, keepdims=True)
+        head = pivot + jnp.where(pivot < 0.0, -1.0, 1.0) * jnp.sqrt(pivot * pivot + below)
+        normal = jnp.where(row > k, column, jnp.where(row == k, head, 0.0))
+        # A column with nothing below is left as it is.
+        scaled = normal * jnp.where(below > 0.0, 2.0 / (head * head + below), 0.0)
+        r = r - scaled * jnp.sum(normal * r, -2, keepdims=True)
+        across = jnp.swapaxes(normal, -1, -2)
+        return q - jnp.sum(q * across, -1, keepdims=True) * jnp.swapaxes(scaled, -1, -2), r
+
+    start = jnp.broadcast_to(eye, (*matrix.shape[:-1], m)), matrix
+    q, r = lax.fori_loop(0, min(m, n), step, start)
+    kept = m if params["full_matrices"] else min(m, n)
+    return q[..., :kept], jnp.triu(r[..., :kept, :])
+
+
+REPLACED: dict[str, Callable] = {
+    "dot_general": product,
+    "cholesky": factor,
+    "triangular_solve": solution,
+    "qr": reflections,
+}
 
 
 def _wants(eqn: core.JaxprEqn) -> bool:
     real = not any(jnp.iscomplexobj(v.aval) for v in eqn.invars)
-    return eqn.primitive.name in REPLACED and real
+    return eqn.primitive.name in REPLACED and real and not eqn.params.get("pivoting")
 
 
 def _replace(eqn: core.JaxprEqn, inputs: Sequence, inside: Inside) -> list[Array]:
-    replacement: Any = REPLACED[eqn.primitive.name]
-    return [replacement(eqn.params, *map(jnp.asarray, inputs))]
+    found = REPLACED[eqn.primitive.name](eqn.params, *map(jnp.asarray, inputs))
+    return list(found) if eqn.primitive.multiple_results else [found]

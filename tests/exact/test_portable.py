@@ -90,6 +90,16 @@ def test_factors_and_solutions_are_those_of_the_library(n, m, batch, data):
     np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (4, 4), (7, 3), (3, 7), (2, 5, 5), (2, 3, 1, 4)])
+@pytest.mark.parametrize("full", [True, False])
+def test_an_orthogonal_matrix_is_that_of_the_library(shape, full):
+    function = lambda x: lax.linalg.qr(x, full_matrices=full)  # noqa: E731
+    x = numbers(*shape)
+    x[..., 0] = np.arange(shape[-2]) == 0  # nothing below: LAPACK reflects nothing
+    for found, wanted in zip(exact.without_libraries(function)(x), function(x), strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-5)
+
+
 def test_a_matrix_that_is_not_positive_has_no_factor():
     matrix = np.diag([1.0, -1.0, 1.0]).astype(np.float32)
     assert np.isnan(exact.without_libraries(jnp.linalg.cholesky)(matrix)).any()
@@ -98,7 +108,7 @@ def test_a_matrix_that_is_not_positive_has_no_factor():
 @pytest.mark.parametrize(
     ("function", "named"),
     [
-        (lambda x: jnp.linalg.qr(x)[0], "qr|geqrf"),
+        (lambda x: jax.scipy.linalg.qr(x, pivoting=True)[0], "qr|geqp3"),
         (lambda x: lax.map(jnp.linalg.svd, x[None])[0], "svd"),
         (lambda x: jnp.linalg.solve(x, x[0]), "lu"),
         (lambda x: jnp.linalg.cholesky(x + 1j).real, "cholesky"),
@@ -117,7 +127,7 @@ import jax, jax.numpy as jnp, numpy as np
 draw = lambda *shape: np.random.default_rng(0).normal(size=shape).astype("f")
 x, w = draw(999, 60), draw(60, 99)
 layers = lambda w: jnp.tanh(jnp.tanh(x @ w) @ w.T) * jax.lax.rsqrt(1 + x * x)
-factor = lambda w: jnp.linalg.cholesky(w @ w.T + 9 * jnp.eye(60))
+factor = lambda w: jnp.linalg.cholesky(w @ w.T + 9 * jnp.eye(60)) + jnp.linalg.qr(w)[0]
 function = jax.value_and_grad(lambda w: factor(w).sum() + layers(w).sum())
 found = jax.jit(exact.without_libraries(function))(w)
 print(hashlib.sha256(b''.join(np.asarray(leaf).tobytes() for leaf in found)).hexdigest())
