@@ -45,7 +45,7 @@ def test_groups_have_marks_and_unfinished_runs_are_drawn(tmp_path, terminal, cap
     with Image.open(tmp_path / "f.png") as picture:
         colors = {tuple(c) for c in np.asarray(picture.convert("RGB")).reshape(-1, 3)}
     assert len(colors) > 20
-    assert any(r > 220 and 100 < g < 200 and b < 100 for r, g, b in colors)  # the unfinished one
+    assert any(r > 220 and 100 < g < 220 and b < 160 for r, g, b in colors)  # the unfinished one
 
 
 def test_other_metrics_and_odd_numbers(tmp_path, terminal, capsys):
