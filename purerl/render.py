@@ -35,12 +35,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def command(options: Options) -> None:
-    """Makes the video, and prints where it is."""
+    """Makes the video, and prints which files it made."""
     show(*make(options))
 
 
 def make(options: Options) -> list[str]:
-    """Checks the options and makes the video; returns lines about it, the last one its path."""
+    """Checks the options and makes the video; returns lines about it, the last ones its files."""
     from purerl.report.opengl import open_gl
 
     size = _parse_size(options.size)
@@ -56,7 +56,7 @@ def make(options: Options) -> list[str]:
     run = load(options.run, options.checkpoint, options.engine, options.trust)
     about = (options.camera, options.episodes, options.seconds, size, options.seed)
     path, lines = make_video(run, *about)
-    return [*lines, str(path)]
+    return [*lines, str(path.with_suffix(".png")), str(path)]
 
 
 def _parse_size(size: str) -> tuple[int, int]:

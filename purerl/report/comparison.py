@@ -193,6 +193,7 @@ def draw_curves(path: Path, curves: Iterable[Curve], metric: str) -> None:
     matplotlib.rcParams["text.parse_math"] = False  # labels have settings in them, any text
     from matplotlib import pyplot
 
+    pyplot.style.use("tableau-colorblind10")
     figure, axes = pyplot.subplots(figsize=(8, 5), layout="constrained")
     for i, curve in enumerate(curves):
         color = f"C{i % 10}"

@@ -91,6 +91,10 @@ def _controls(groups: Sequence[Group]) -> Html:
     several = len(groups) > 1
     parts = []
     for g, group in enumerate(groups):
+        if len(group.runs) == 1:
+            label = f"{group.label}: {group.runs[0].path.name}"
+            parts.append(_box(f"g{g}", label, look(g, 0, several), key=f"{g}/0"))
+            continue
         label = f"{group.label} (n = {len(group.runs)})"
         boxes = [_box(f"g{g}", label, look(g, None, several), key=f"{g}/mean")]
         for r, run in enumerate(group.runs):

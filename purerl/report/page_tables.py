@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from purerl.report.comparison import GROUPS, VERSUS, cell, notes
-from purerl.report.html_elements import Html, element, table
+from purerl.report.html_elements import Html, element, join, table
 from purerl.report.page_series import RETURN, SPREAD
 from purerl.report.run_reader import RunRecord
 
@@ -57,7 +57,8 @@ def _exactness(manifest: dict[str, Any]) -> Html:
         return element("span", "yes", class_="good")
     why = manifest.get("inexact_because")
     reasons = "; ".join(map(str, why)) if isinstance(why, list) else ""
-    return element("span", _cut(f"no: {reasons}") if said is False else "not said", class_="bad")
+    word = element("span", "no" if said is False else "not said", class_="bad")
+    return join([word, _cut(f": {reasons}") if reasons else ""])
 
 
 def _digest(run: RunRecord) -> str:

@@ -47,7 +47,7 @@ def draw(curves: Sequence[Curve], metric: str, columns: int, rows: int) -> list[
     for i, row in enumerate(field):
         label = short(high - (high - low) * i / (rows - 1)) if i in every_fourth else ""
         lines.append(f"{label[:LABEL]:>{LABEL}}|{''.join(row)}".rstrip())
-    lines.append(f"{'':{LABEL}}+{'-' * (columns - 1)}")
+    lines.append(f"{'':{LABEL}}+{'-' * columns}")
     end = f"{short(last)} steps"
     lines.append(f"{'':{LABEL}} 0{end:>{columns - 1}}")
     legend = zip(curves, cycle(MARKS), strict=False)

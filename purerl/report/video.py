@@ -2,7 +2,7 @@
 
 import contextlib
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,9 @@ from PIL import Image
 
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.keys import Purpose, derive
+from purerl.report import run_reader
 from purerl.report.episode_pictures import Recording, episode_pictures, frame_stride, record
+from purerl.report.page_series import RETURN
 from purerl.report.renderer import Renderer
 from purerl.runs.files import check_inside
 from purerl.runs.loaded_run import Run
@@ -35,7 +37,7 @@ def make_video(
       seed: of the episodes.
 
     Returns:
-      The video's path, and a line about each episode.
+      The video's path, and a line about each episode and one about the last evaluation.
 
     Raises:
       UserError: the run, the checkpoint or the camera is not one.
@@ -62,11 +64,39 @@ def make_video(
         frames = (frame for each in pictures for frame in renderer.draw_episode(each))
         _write_files(path, frames, sum(map(len, pictures)), size, 1.0 / (stride * timestep))
     told = zip(recording.length, recording.over, recording.episode_return, strict=True)
-    return path, [
+    lines = [
         f"update {run.update:,}, episode {i + 1}: {length * timestep:.1f} s "
         f"({'to its end' if over else 'cut there'}), return {episode_return:.2f}"
         for i, (length, over, episode_return) in enumerate(told)
     ]
+    whole = [float(value) for value in recording.episode_return[recording.over]]
+    with contextlib.suppress(UserError):  # metrics that cannot be read spoil no video
+        lines += beside_evaluation(run_reader.read(run.folder).lines, run.update, whole)
+    return path, lines
+
+
+def beside_evaluation(
+    lines: Sequence[dict[str, Any]], update: int, whole: Sequence[float]
+) -> list[str]:
+    """Returns a line that holds episodes' returns against the last evaluation; [] without one.
+
+    Args:
+      lines: of metrics.jsonl.
+      update: the checkpoint's; what came later is not looked at.
+      whole: returns of the episodes that came to their end.
+    """
+    known = [line for line in lines if line["update"] <= update and line.get(RETURN) is not None]
+    if not known:
+        return []
+    mean, std, low, high = (known[-1].get(f"{RETURN}{end}") for end in ("", "_std", "_min", "_max"))
+    if std is None or low is None or high is None:
+        return []
+    among = sum(low <= value <= high for value in whole)
+    said = f"evaluation after update {known[-1]['update']:,}: return {mean:.2f} +- {std:.2f}, "
+    said += f"from {low:.2f} to {high:.2f}; "
+    if not whole:
+        return [said + "no episode above came to its end, so their returns are no match for that"]
+    return [said + f"of {len(whole)} whole episodes above, {among} are in that range"]
 
 
 def _play(run: Run, episodes: int, seconds: float, seed: int) -> Recording:

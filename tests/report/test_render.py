@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from envs import cartpole_swingup
 from purerl import render, run
 from purerl.core.errors import FAILURE, USAGE, RunError
 from purerl.core.keys import per_environment
-from purerl.report import episode_pictures, opengl, renderer as drawing
+from purerl.report import episode_pictures, opengl, renderer as drawing, video
 from purerl.runs.policy import Policy
 from purerl.runs.restored_run import restore
 from tests import quick
@@ -75,7 +76,10 @@ def test_video_and_sheet_show_the_episode_in_real_time(trained, capsys):
         frame = np.asarray(Image.fromarray(frames[moment]).resize((320, 240)), int)
         assert np.abs(cells[y : y + 240, x : x + 320] - frame).mean() < 3
     said = capsys.readouterr().out
-    assert "update 3, episode 2: 0.8 s (cut there)" in said and "000000000003.mp4" in said
+    assert "update 3, episode 2: 0.8 s (cut there)" in said
+    files = [line.rpartition("/")[2] for line in said.splitlines()[-2:]]
+    assert files == ["000000000003.png", "000000000003.mp4"]
+    assert "no episode above came to its end" in said
 
 
 def test_what_is_not_the_default_stands_in_the_name(trained, capsys):
@@ -83,7 +87,21 @@ def test_what_is_not_the_default_stands_in_the_name(trained, capsys):
     assert render.main([str(trained), *words]) == 0
     _, frames = read_video(trained / "videos" / "000000000003_front_seed3.mp4")
     assert len(frames) == 61  # the whole episode
-    assert "1.2 s (to its end)" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "1.2 s (to its end)" in said
+    assert re.search(r"evaluation after update 3: return .* of 1 whole episodes above, [01] ", said)
+
+
+def test_returns_are_held_against_the_evaluation_before_the_checkpoint():
+    about = {"eval/episode_return_std": 1.0, "eval/episode_return_min": 4.0}
+    about |= {"eval/episode_return": 5.0, "eval/episode_return_max": 7.0}
+    lines = [{"update": 2} | about, {"update": 3, "train/loss": 1.0}]
+    lines.append({"update": 4} | {name: 100.0 for name in about})
+    (said,) = video.beside_evaluation(lines, 3, [3.9, 4.0, 7.0, 7.1])
+    assert "after update 2: return 5.00 +- 1.00, from 4.00 to 7.00; of 4 whole" in said
+    assert said.endswith("above, 2 are in that range")
+    assert video.beside_evaluation(lines[1:], 3, [5.0]) == []
+    assert video.beside_evaluation([{"update": 1, "eval/episode_return": 5.0}], 3, [5.0]) == []
 
 
 # --- the episode ---
