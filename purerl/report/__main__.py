@@ -48,7 +48,8 @@ def command(options: Options) -> None:
     runs = [read(path) for path in find_runs(options.runs)]
     page = make_page(runs, options.group_by).encode()
     write_file(options.out, page)
-    show(f"{options.out} ({len(runs)} runs, {len(page):,} bytes): open it in a browser")
+    number = f"{len(runs)} run{'s' * (len(runs) > 1)}"
+    show(f"{options.out} ({number}, {len(page):,} bytes): open it in a browser")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,16 @@ from purerl.report import comparison, page_tables
 from purerl.report.html_elements import Html, element, join
 from purerl.report.page_charts import SMALL, WIDE, chart, look, short
 from purerl.report.page_media import LARGEST_PAGE, Media, media_elements, read_media, size
-from purerl.report.page_series import RETURN, SECTIONS, Panel, Series, constant, panels
+from purerl.report.page_series import (
+    MOST_PANELS,
+    RETURN,
+    SECTIONS,
+    Panel,
+    Series,
+    constant,
+    metric_names,
+    panels,
+)
 from purerl.report.run_reader import RunRecord
 from purerl.report.seed_statistics import Group, make_groups
 
@@ -43,6 +52,7 @@ def make_page(runs: Sequence[RunRecord], group_by: Sequence[str] = ()) -> str:
         *_section("Scores", *page_tables.scores(result)),
         _controls(groups),
         *_charts(sections, len(groups) > 1),
+        *_unseen(runs),
         *_section("Last evaluation of each run", page_tables.evaluations(runs)),
         *_section("Settings", *page_tables.settings(runs, result)),
         *_section("Videos", *_media(runs)),
@@ -133,6 +143,13 @@ def _charts(sections: Sequence[tuple[str, list[Panel]]], several: bool) -> list[
         if wide:
             parts.append(element("p", BANDS, class_="note"))
     return parts
+
+
+def _unseen(runs: Sequence[RunRecord]) -> list[Html]:
+    """Returns a line about metrics that have no chart; empty where all have."""
+    more = len(metric_names(runs)) - MOST_PANELS
+    said = f"{more:,} more metrics have no chart: a page takes {MOST_PANELS}."
+    return [element("p", said, class_="note")] if more > 0 else []
 
 
 BANDS = (

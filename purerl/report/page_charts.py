@@ -148,7 +148,9 @@ def _scale(
     ]  # fmt: skip
     # Means last, over the runs.
     series = sorted(panel.series, key=lambda s: s.run is None)
-    drawn = [part for s in series for part in _draw(s, across, up, several)]
+    # Beside means of several groups their runs step back.
+    faint = several and series[-1].run is None
+    drawn = [part for s in series for part in _draw(s, across, up, several, faint)]
     return element("g", *grid, *drawn, class_=f"scale {kind}")
 
 
@@ -160,7 +162,7 @@ def look(group: int, run: int | None, several: bool) -> str:
     return f"c{number % COLORS} d{min(number // COLORS, 2)}"
 
 
-def _draw(series: Series, across: Place, up: Place, several: bool) -> list[Html]:
+def _draw(series: Series, across: Place, up: Place, several: bool, faint: bool) -> list[Html]:
     xs = [across(s) for s in series.steps]
     about = {"data_group": series.group, "data_run": "mean" if series.run is None else series.run}
     style = look(series.group, series.run, several)
@@ -172,7 +174,7 @@ def _draw(series: Series, across: Place, up: Place, several: bool) -> list[Html]
     points = list(zip(xs, map(up, series.values), strict=True))
     if len(points) == 1:  # a path of one point shows nothing
         points.append((points[0][0] + 2, points[0][1]))
-    kind = "mean" if series.run is None else "line"
+    kind = "mean" if series.run is None else "line faint" if faint else "line"
     return [*parts, element("path", d=_path(points), class_=f"{kind} {style}", **about)]
 
 

@@ -7,6 +7,7 @@ from purerl.report.run_reader import RunRecord
 from purerl.report.seed_statistics import Group, learning_curve
 
 MOST_POINTS = 400  # of a line; a chart is some 500 pixels wide
+MOST_PANELS = 300  # a page with more is slow to open
 HUGE = 1e150  # what is beyond cannot be drawn beside anything, and overflows when squared
 MOST_BANDS = 6  # runs up to which each shows its own spread
 RETURN = "eval/episode_return"
@@ -52,7 +53,8 @@ def panels(groups: Sequence[Group]) -> list[tuple[str, list[Panel]]]:
     """Returns the charts by section, sections without any left out."""
     names = metric_names(run for group in groups for run in group.runs)
     found: dict[str, list[Panel]] = {title: [] for title, _ in SECTIONS}
-    for name in sorted(names, key=lambda name: name != RETURN):  # evaluation's return first
+    names.sort(key=lambda name: name != RETURN)  # evaluation's return first
+    for name in names[:MOST_PANELS]:
         series = series_of(groups, name)
         if series:
             found[section_of(name)].append(Panel(name, series))

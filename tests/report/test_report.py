@@ -85,6 +85,7 @@ def test_two_groups_of_five_seeds(tmp_path):
                inexact_because=["engine warp"])  # fmt: skip
     page = read(tmp_path, tmp_path / "runs")
     assert page.texts("h1") == ["walk: 10 runs"]
+    assert "line faint c0 d0" in [a["class"] for a in paths(page, "eval/episode_return")]
     kinds = [about["class"].split()[0] for about in paths(page, "eval/episode_return")]
     assert kinds.count("line") == 10 and kinds.count("mean") == kinds.count("band") == 2
     means = [a for a in paths(page, "eval/episode_return") if a["class"].startswith("mean")]
@@ -144,6 +145,13 @@ def test_a_long_run_is_thinned_and_keeps_its_extremes(tmp_path):
     assert len(steps) == len(means) <= 400 and steps[-1] == 5001
     assert min(low) == 0.0 and max(high) == 6.0
     assert means[0] == pytest.approx(sum(values[:13]) / 13)
+
+
+def test_a_page_takes_so_many_charts_and_says_so(tmp_path):
+    more = {f"train/m{i}": float(i) for i in range(350)}
+    page = read(tmp_path, make_run(tmp_path / "a", 1, [1.0, 2.0], more=more))
+    assert len(data(page)) == 300
+    assert "52 more metrics have no chart" in "".join(page.texts("p"))  # of 350, return and loss
 
 
 @pytest.mark.parametrize(
