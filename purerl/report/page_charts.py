@@ -148,9 +148,9 @@ def _scale(
     ]  # fmt: skip
     # Means last, over the runs.
     series = sorted(panel.series, key=lambda s: s.run is None)
-    # Beside means of several groups their runs step back.
-    faint = several and series[-1].run is None
-    drawn = [part for s in series for part in _draw(s, across, up, several, faint)]
+    # Where groups have means, their runs step back.
+    means = {s.group for s in series if s.run is None} if several else set()
+    drawn = [part for s in series for part in _draw(s, across, up, several, s.group in means)]
     return element("g", *grid, *drawn, class_=f"scale {kind}")
 
 

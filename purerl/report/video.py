@@ -96,7 +96,7 @@ def beside_evaluation(
     said += f"from {low:.2f} to {high:.2f}; "
     if not whole:
         return [said + "no episode above came to its end, so their returns are no match for that"]
-    return [said + f"of {len(whole)} whole episodes above, {among} are in that range"]
+    return [said + f"whole episodes above in that range: {among} of {len(whole)}"]
 
 
 def _play(run: Run, episodes: int, seconds: float, seed: int) -> Recording:

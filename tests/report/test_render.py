@@ -89,7 +89,9 @@ def test_what_is_not_the_default_stands_in_the_name(trained, capsys):
     assert len(frames) == 61  # the whole episode
     said = capsys.readouterr().out
     assert "1.2 s (to its end)" in said
-    assert re.search(r"evaluation after update 3: return .* of 1 whole episodes above, [01] ", said)
+    assert re.search(
+        r"evaluation after update 3: return .* whole .* in that range: [01] of 1", said
+    )
 
 
 def test_returns_are_held_against_the_evaluation_before_the_checkpoint():
@@ -98,8 +100,8 @@ def test_returns_are_held_against_the_evaluation_before_the_checkpoint():
     lines = [{"update": 2} | about, {"update": 3, "train/loss": 1.0}]
     lines.append({"update": 4} | {name: 100.0 for name in about})
     (said,) = video.beside_evaluation(lines, 3, [3.9, 4.0, 7.0, 7.1])
-    assert "after update 2: return 5.00 +- 1.00, from 4.00 to 7.00; of 4 whole" in said
-    assert said.endswith("above, 2 are in that range")
+    assert "after update 2: return 5.00 +- 1.00, from 4.00 to 7.00; " in said
+    assert said.endswith("in that range: 2 of 4")
     assert video.beside_evaluation(lines[1:], 3, [5.0]) == []
     assert video.beside_evaluation([{"update": 1, "eval/episode_return": 5.0}], 3, [5.0]) == []
 

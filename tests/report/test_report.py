@@ -102,6 +102,14 @@ def test_two_groups_of_five_seeds(tmp_path):
     assert "train/loss = 0.5" in "".join(page.texts("p"))  # a line of text instead of a flat curve
 
 
+def test_a_run_that_is_its_group_stands_out_as_a_mean_does(tmp_path):
+    make_seeds(tmp_path / "runs", "a", [1.0, 2.0])
+    make_run(tmp_path / "runs" / "b", 1, [1.0, 2.0, 3.0, 4.0], rate=1.0)
+    found = paths(read(tmp_path, tmp_path / "runs"), "eval/episode_return")
+    kinds = [about["class"] for about in found if "band" not in about["class"]]
+    assert kinds == ["line faint c0 d0", "line faint c0 d0", "line c1 d0", "mean c0 d0"]
+
+
 def test_how_far_each_came(tmp_path):
     make_run(tmp_path / "runs" / "done", 1, [1.0] * 4)
     make_run(tmp_path / "runs" / "killed", 2, [1.0, 2.0])
