@@ -329,7 +329,7 @@ def test_a_truly_full_disk_loses_nothing(whole, tmp_path, small_disk):
     assert process.returncode == FAILURE, wrong
     assert "could not be saved" in said and "Traceback" not in said + wrong
     last = checkpoints(runs)[-1]
-    assert f"the newest on the disk is of update {last}. Make room" in wrong and last < 12
+    assert f"The newest on the disk is of update {last}. Mend that" in wrong and last < 12
     assert enlarge() == 0
     assert start(runs, *words, "--resume") == SUCCESS
     assert digest(runs) == digest(whole)
