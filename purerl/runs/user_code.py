@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+from jax._src import dispatch  # JAX has no public way to forget a callback that failed
 
 from purerl.core.errors import RunError, UserError, one_line
 
@@ -114,5 +115,6 @@ def running() -> Iterator[None]:
         where = _last_own(frames[max(ours, default=0) :]) if lines else own_line(error)
         if isinstance(error, RunError | UserError) or not (lines or where):
             raise
+        dispatch.runtime_tokens.clear()  # or JAX tells it again, with tracebacks, at the end
         what = lines[-1] if lines else one_line(error)
         raise RunError(f"A function called from a compiled program raised {what}{where}") from error
