@@ -32,8 +32,8 @@ class PolicyOptions:
         """Raises ValueError for a scale or a width that is none."""
         if not MIN_SCALE <= self.initial_std <= 100.0:
             raise ValueError(f"initial_std is {self.initial_std}; it must be {MIN_SCALE} to 100.")
-        for name, x in vars(self).items():
-            if min(x if isinstance(x, tuple) else [x] if isinstance(x, int) else [], default=1) < 1:
+        for name in {"policy_hidden", "value_hidden", "hidden", "encoder"} & vars(self).keys():
+            if min(jax.tree.leaves(x := vars(self)[name]), default=1) < 1:
                 raise ValueError(f"{name} is {x}; a layer has at least 1 unit.")
 
 
