@@ -76,7 +76,7 @@ def __dir__() -> list[str]:
 def _hint(name: str) -> str:
     """Returns the line to write instead of a wrong name, or the names that there are."""
     known = {public.lower(): public for public in __all__}
-    near = difflib.get_close_matches(name.lower(), known, n=1)
+    near = difflib.get_close_matches(name.lower(), known, n=1, cutoff=0.7)
     if near:
         return f"write `from purerl import {known[near[0]]}`."
     return f"the names to import from purerl are {', '.join(__all__)}."

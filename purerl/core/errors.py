@@ -1,6 +1,7 @@
 """Errors that a person can act on: one line that says what is wrong and how to mend it."""
 
 import difflib
+import re
 from collections.abc import Iterable
 
 SUCCESS = 0
@@ -27,6 +28,27 @@ class StoppedError(Exception):
     exit_code = INTERRUPTED
 
 
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """Returns the valid name that a wrong one is surely meant to be, or "".
+
+    >>> nearest("ppo.learing_rate", ["ppo.clip", "ppo.learning_rate"])
+    'ppo.learning_rate'
+    >>> nearest("ppo.lr", ["ppo.clip", "ppo.learning_rate"])  # its initials
+    'ppo.learning_rate'
+    >>> nearest("reward_near", ["train/reward"])
+    ''
+    """
+    last = {v: re.split(r"[./]", v)[-1] for v in valid}
+    tail = re.split(r"[./]", name)[-1]
+    for whole, part in last.items():
+        if len(tail) > 1 and tail == "".join(word[:1] for word in re.split("[-_]", part)):
+            return whole
+    near = difflib.get_close_matches(name, last, n=1, cutoff=0.65)
+    # What only the beginning has in common, such as "ppo.", is no likeness.
+    alike = near and difflib.SequenceMatcher(None, tail, last[near[0]]).ratio() >= 0.6
+    return near[0] if alike else ""
+
+
 def unknown_name(kind: str, name: str, valid: Iterable[str], where: str = "") -> str:
     """Returns the message for a name that does not exist: the nearest one, then all there are.
 
@@ -37,8 +59,8 @@ def unknown_name(kind: str, name: str, valid: Iterable[str], where: str = "") ->
       where: where it was looked for, such as " in these runs".
     """
     valid = [v for v in valid if v]
-    near = difflib.get_close_matches(str(name), valid, n=1, cutoff=0.5)
-    hint = f" Did you mean {near[0]!r}?" if near else ""
+    near = nearest(str(name), valid)
+    hint = f" Did you mean {near!r}?" if near else ""
     return f"There is no {kind} {name!r}{where}.{hint} There are: {', '.join(valid) or 'none'}."
 
 

@@ -121,6 +121,11 @@ class Physics:
         Raises:
           ValueError: an unknown engine or reading, or a model with state that is not carried.
         """
+        if not isinstance(model, mujoco.MjModel):
+            raise ValueError(
+                f"model is a {type(model).__name__}; it must be a mujoco.MjModel, such as "
+                "mujoco.MjModel.from_xml_path(path)."
+            )
         self.engine = choose_engine(engine)
         _check_model(model, tuple(n for n in readings if n not in overflow_reading(self.engine)))
         if substeps < 1:

@@ -29,11 +29,12 @@ class PolicyOptions:
     """Policy scale before training, in raw-action units."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for a scale that is none."""
+        """Raises ValueError for a scale or a width that is none."""
         if not MIN_SCALE <= self.initial_std <= 100.0:
-            raise ValueError(
-                f"initial_std is {self.initial_std}; it must be from {MIN_SCALE} to 100."
-            )
+            raise ValueError(f"initial_std is {self.initial_std}; it must be {MIN_SCALE} to 100.")
+        for name in {"policy_hidden", "value_hidden", "hidden", "encoder"} & vars(self).keys():
+            if min(jax.tree.leaves(x := vars(self)[name]), default=1) < 1:
+                raise ValueError(f"{name} is {x}; a layer has at least 1 unit.")
 
 
 @dataclass(frozen=True)

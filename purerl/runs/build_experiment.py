@@ -1,10 +1,8 @@
 """An experiment's objects, built from its settings; what breaks a rule of theirs, in one line."""
 
 import contextlib
-import traceback
-from collections.abc import Iterator
-from pathlib import Path
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +10,14 @@ import jax.numpy as jnp
 from purerl.core.env import Env, EnvError
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.records import Network, PolicyOutput, PyTree
+from purerl.devices import memory
 from purerl.devices.check_sizes import check_minibatches
 from purerl.devices.programs import abstract_state
 from purerl.ppo.config import Config
 from purerl.ppo.learner import is_recurrent
-from purerl.runs.check_env import check_fields, check_members, check_shapes
+from purerl.runs.check_env import check_fields, check_members, check_shapes, shapes_of_reset
 from purerl.runs.experiment import Experiment
+from purerl.runs.user_code import check_takes, told
 
 
 class Setup(NamedTuple):
@@ -34,29 +34,66 @@ def build(chosen: Experiment) -> Setup:
     # Imported here, as below: `compare` reads runs, and needs no MuJoCo.
     from purerl.physics.interface import choose_engine
 
-    try:
+    _check_precision()
+    check_takes("build_env", chosen.build_env, "options", "engine")
+    check_takes("build_network", chosen.build_network, "options", "observation", "action_size")
+    with told(""):
         engine = choose_engine(chosen.engine)
+    with told("build_env: "):
         env = chosen.build_env(chosen.env, engine)
+    if env is None:
+        raise UserError("build_env returned None: its last line must return the environment.")
+    about = f"The environment {type(env).__name__}: "
+    with told(""):
         check_members(env)
-        with blame(env):
-            state = jax.eval_shape(env.reset, jax.random.key(0))
-            check_fields(state)
-            zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state.observation)
+    with told(about):
+        state = shapes_of_reset(env)
+        check_fields(state)
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state.observation)
+    with told("build_network: "):
         network = chosen.build_network(chosen.network, zeros, env.action_size)
-        setup = Setup(chosen.ppo, env, network, engine)
-        with blame(env):
-            _check_network(network, zeros, env.action_size)
-            # Sizes that do not fit together show here, in a second.
-            abstract = abstract_state(*setup[:3])
-            check_minibatches(setup.config, is_recurrent(abstract.carry), setup.config.num_envs)
-    except (ValueError, ImportError) as error:
-        raise UserError(one_line(error)) from error
+    setup = Setup(chosen.ppo, env, network, engine)
+    with told(""):
+        _check_network(network, zeros, env.action_size)
+    with told(""), blame(env):
+        # Sizes that do not fit together show here, in a second.
+        abstract = abstract_state(*setup[:3])
+        check_minibatches(setup.config, is_recurrent(abstract.carry), setup.config.num_envs)
     return setup
+
+
+def check_memory(setup: Setup, abstract: PyTree, seeds: int, devices: int) -> None:
+    """Raises UserError, with the size to lower, if a run cannot fit into a device's memory.
+
+    Args:
+      setup: the experiment's objects.
+      abstract: shapes of one seed's state.
+      seeds: how many share the program.
+      devices: how many share the environments.
+    """
+    parts = memory.least(setup.config, abstract, setup.env.action_size)
+    with told(""):
+        memory.check_room({k: x * seeds // devices for k, x in parts.items()}, memory.room())
+
+
+def _check_precision() -> None:
+    if jax.config.read("jax_enable_x64"):
+        raise UserError(
+            "JAX_ENABLE_X64 is on, which makes numbers float64; a run computes in float32: unset "
+            'it, or call jax.config.update("jax_enable_x64", False).'
+        )
 
 
 def _check_network(network: Network, observation: PyTree, action_size: int) -> None:
     """Raises ValueError unless a network's answers have the shapes that the trainer reads."""
-    params, carry = jax.eval_shape(network.init, jax.random.key(0))
+    if not isinstance(network, Network):
+        raise ValueError(
+            f"build_network returned a {type(network).__name__}; it must return a "
+            "purerl.Network(init, apply). Of a Flax module, networks.from_linen makes one."
+        )
+    check_takes("network.init", network.init, "key")
+    check_takes("network.apply", network.apply, "params", "observation", "memory")
+    params, carry = _pair("init(key)", "parameters", network.init, jax.random.key(0))
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
             raise ValueError(
@@ -67,7 +104,8 @@ def _check_network(network: Network, observation: PyTree, action_size: int) -> N
     batch = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct((2, *x.shape), x.dtype), (observation, carry)
     )
-    output, following = jax.eval_shape(network.apply, params, *batch)
+    said = "apply(params, observation, memory)"
+    output, following = _pair(said, "a purerl.PolicyOutput", network.apply, params, *batch)
     if not isinstance(output, PolicyOutput):
         raise ValueError(
             f"The network's `apply` returned a {type(output).__name__} and a memory; it must be "
@@ -90,6 +128,18 @@ def _check_network(network: Network, observation: PyTree, action_size: int) -> N
         )
 
 
+def _pair(call: str, first: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Returns the shapes of what a network's function returns: two things, the second a memory."""
+    with told(f"The network's {call}: "):
+        found = jax.eval_shape(function, *arguments)
+    if type(found) is not tuple or len(found) != 2:
+        raise ValueError(
+            f"The network's {call} returned a {type(found).__name__}; it must return {first} and "
+            "the memory, which is () of a network without one."
+        )
+    return found
+
+
 @contextlib.contextmanager
 def blame(env: Env) -> Iterator[None]:
     """Makes one line of programs that cannot be traced because the environment breaks a rule.
@@ -104,22 +154,12 @@ def blame(env: Env) -> Iterator[None]:
         try:
             check_shapes(env)
         except EnvError as broken:
-            what = f"{one_line(broken)}{own_line(broken.__cause__)}"
+            what = one_line(broken)
             raise UserError(f"The environment {type(env).__name__}: {what}") from error
         except Exception:
             pass  # no rule, but an error in its code, of which the first one tells more
-        raise
-
-
-def own_line(error: BaseException | None) -> str:
-    """Returns " (FILE, line N)": the last line of the user's own code on the way to an error.
-
-    Code of this library and of installed packages is not the user's. "" if no line is.
-    """
-    frames = traceback.extract_tb(error.__traceback__ if error else None)
-    others = ("site-packages", "dist-packages", str(Path(__file__).parent.parent))
-    own = [frame for frame in frames if not any(other in frame.filename for other in others)]
-    return f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""
+        with told(""):
+            raise
 
 
 def physics_hash(env: Env) -> str | None:

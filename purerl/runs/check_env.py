@@ -7,8 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from purerl.core.env import ABSURD, Env, EnvError, State
+from purerl.core.errors import UserError
 from purerl.core.records import Array, PyTree, is_key
 from purerl.runs.state_arrays import flatten
+from purerl.runs.user_code import check_takes, in_words, own_line
+
+RESERVED = {"episode_return", "episode_length", "lost"}  # what an evaluation measures itself
 
 
 def check_env(env: Env, num_envs: int = 4, num_steps: int = 4) -> None:
@@ -50,7 +54,7 @@ def check_env(env: Env, num_envs: int = 4, num_steps: int = 4) -> None:
 def check_shapes(env: Env) -> None:
     """Verifies what of the protocol shows without computing anything; EnvError as `check_env`."""
     check_members(env)
-    fresh = jax.eval_shape(env.reset, jax.random.key(0))
+    fresh = shapes_of_reset(env)
     check_fields(fresh)
     action = jax.ShapeDtypeStruct((env.action_size,), jnp.float32)
     try:
@@ -58,13 +62,26 @@ def check_shapes(env: Env) -> None:
     except Exception as error:
         raise EnvError(
             f"step cannot be traced with an action of env.action_size = {env.action_size} "
-            f"numbers, as jit needs: {error}"
+            f"numbers, as jit needs: {in_words(error)}{own_line(error)}"
         ) from error
+    if not isinstance(following, State):
+        raise EnvError(f"step returned a {type(following).__name__}: it must return env.State.")
     _check_same(_specs(fresh), _specs(following))
+
+
+def shapes_of_reset(env: Env) -> Any:
+    """Returns the shapes of what reset returns; EnvError if it cannot be traced."""
+    try:
+        return jax.eval_shape(env.reset, jax.random.key(0))
+    except Exception as error:
+        what = f"{in_words(error)}{own_line(error)}"
+        raise EnvError(f"reset cannot be traced, as jit needs: {what}") from error
 
 
 def check_members(env: Env) -> None:
     """Verifies that an environment has what every one has, of the right kind."""
+    if isinstance(env, type):
+        raise EnvError(f"the environment is a class: give an object, {env.__name__}(...).")
     for name in ("control_timestep", "action_size", "reset", "step"):
         if not hasattr(env, name):
             raise EnvError(
@@ -80,6 +97,11 @@ def check_members(env: Env) -> None:
     size = env.action_size
     if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 1:
         raise EnvError(f"env.action_size is {size!r}: it must be a positive int.")
+    try:
+        check_takes("env.reset", env.reset, "key")
+        check_takes("env.step", env.step, "state", "action")
+    except UserError as error:
+        raise EnvError(str(error)) from error
 
 
 def check_fields(state: Any) -> None:
@@ -90,6 +112,10 @@ def check_fields(state: Any) -> None:
     scalars = {name: (getattr(state, name), dtype) for name, dtype in rules.items()}
     if not isinstance(state.metrics, dict):
         raise EnvError(f"metrics is a {type(state.metrics).__name__}: it must be a dict.")
+    for name in sorted(RESERVED & state.metrics.keys()):
+        raise EnvError(
+            f"metrics has the name {name!r}, which is the trainer's own: give the metric another."
+        )
     for name, value in state.metrics.items():
         scalars[f"metrics[{name!r}]"] = (value, jnp.float32)
     for name, (value, dtype) in scalars.items():
@@ -155,6 +181,17 @@ def _check_finite(when: str, state: PyTree) -> None:
                 f"{name} is {what} after {when}: every number must be finite, and at most "
                 f"{ABSURD:.0e}, for any actions in [-1, 1], or the episode counts as lost."
             )
+
+
+def lost_part(state: PyTree) -> str:
+    """Names what is NaN or absurd in states that were reset because they were lost, or ""."""
+    if jax.process_count() > 1:  # each has a part of them only
+        return ""
+    try:
+        _check_finite("reset", state)
+    except EnvError as error:
+        return str(error)
+    return ""
 
 
 def _check_bits(what: str, first: PyTree, second: PyTree, rule: str) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import tyro
 
-from purerl.core.errors import SUCCESS, RunError, UserError
+from purerl.core.errors import SUCCESS, RunError, UserError, nearest
 from purerl.runs import experiment, output
 from purerl.runs.command_errors import tell
 from purerl.runs.experiment import Experiment, Source
@@ -78,6 +78,11 @@ def from_settings(
       settings: "ppo.num_envs" -> value.
       options: "num_seeds" -> value.
     """
+    for name, value in settings.items():
+        held = getattr(source.experiment, name, None)
+        if isinstance(value, Mapping) and dataclasses.is_dataclass(held):
+            dotted = {f"{name}.{inner}": one for inner, one in value.items()}
+            raise UserError(f"Settings of {name} have dotted names: give {dotted}.")
     words = [word for pair in {**settings, **options}.items() for word in _words(*pair)]
     return from_command_line(source, words, f"python -m purerl.run {source.name}", WORDS)
 
@@ -107,19 +112,45 @@ def parse(
     except SystemExit as error:
         if not error.code:
             raise
-        raise UserError(f"{_one_line(said.getvalue())} All options: {prog} --help") from error
+        what = _one_line(said.getvalue(), _option_names(kind, default))
+        raise UserError(f"{what} All options: {prog} --help") from error
 
 
-def _one_line(text: str) -> str:
+def _one_line(text: str, names: list[str]) -> str:
     """Returns tyro's framed, coloured message as one line: what is wrong, and the nearest fix."""
     text = re.sub(r"\x1b\[[0-9;]*m", "", text)
-    plain = " ".join(re.sub(r"[─-╿]", " ", text).split())
+    plain = " ".join(re.sub(r"[─-╿]|-{5,}", " ", text).split())
     unknown = re.search(r"Unrecognized options: (\S+?)[,=]? ", plain)
     if unknown:
-        near = re.search(r"(?:meant:|similar to \S+:) (--\S+)", plain)
-        return f"There is no option {unknown[1]}." + (f" Did you mean {near[1]}?" if near else "")
+        near = nearest(unknown[1], names)
+        return f"There is no option {unknown[1]}." + (f" Did you mean {near}?" if near else "")
     titles = "Value error|Missing argument|Invalid choice|Parsing error|Required options"
     plain = re.sub(rf"^({titles}) ", "", plain)
-    plain = re.sub(r"^Error parsing \w+: ", "", plain)  # a rule of a dataclass, in its own words
     plain = re.sub(r" *(Argument helptext:|For full helptext).*", "", plain)
+    for pattern, words in _IN_WORDS:
+        plain = re.sub(pattern, words, plain)
     return plain.rstrip(".") + "." if plain else "The command line is wrong."
+
+
+# Python's words and tyro's, and ours.
+_IN_WORDS = (
+    (
+        r"^Error parsing (\S+): invalid literal .*?: (.*)",
+        r"\1 is \2; it must be a whole number",
+    ),
+    (r"^Error parsing (\S+): could not convert .*?: (.*)", r"\1 is \2; it must be a number"),
+    (r"^invalid choice (.*) for argument '(\S+)'.*\((.*)\)", r"\2 is \1; it must be one of \3"),
+    (r"^Missing from .*?: [A-Z.,\[\]{} ]+?(?=[A-Z][a-z'])", "The command lacks: "),
+    (r" \(required\)", ""),
+    (r"^Error parsing \w+: ", ""),  # a rule of a dataclass, in its own words
+)
+
+
+def _option_names(kind: Any, default: Any, path: str = "--") -> list[str]:
+    """Returns the options of a dataclass, those of dataclasses in it among them."""
+    found = []
+    for field in dataclasses.fields(kind):
+        name, value = path + field.name.replace("_", "-"), getattr(default, field.name, None)
+        inner = dataclasses.is_dataclass(value) and not isinstance(value, type)
+        found += _option_names(value, value, f"{name}.") if inner else [name]
+    return found

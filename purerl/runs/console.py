@@ -10,6 +10,7 @@ from typing import Any
 import jax
 
 from purerl.core.records import PyTree
+from purerl.devices.memory import size
 from purerl.runs import output
 from purerl.runs.build_experiment import Setup
 from purerl.runs.loggers import Record
@@ -63,11 +64,6 @@ def describe_plan(
 
 def _ticks(updates: tuple[int, ...]) -> str:
     return f"{len(updates)}, the first after update {updates[0]:,}" if updates else "none"
-
-
-def size(tree: PyTree) -> int:
-    """Returns the bytes of a tree's arrays; of abstract ones too."""
-    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
 class _Lines:

@@ -23,7 +23,7 @@ import tyro
 from purerl.core.errors import UserError, one_line, unknown_name
 from purerl.ppo.config import Config, Evaluation
 from purerl.runs.files import read_bytes
-from purerl.runs.kinds import fits, hints
+from purerl.runs.kinds import fits, hints, meant
 from purerl.runs.options import Engine
 
 
@@ -164,6 +164,7 @@ def load(
     for field in ("env", "network", "ppo", "evaluation"):
         if not _has_settings(value := getattr(found, field)):
             raise UserError(f"{path}: {field} is {value!r}; it must be a frozen dataclass's value.")
+        to_json(value, field)  # here, or the command line would meet what it cannot hold
     return Source(found, name or path.stem, path, text)
 
 
@@ -199,6 +200,9 @@ def _mistakes(file: str, place: Path) -> Iterator[None]:
             hint = " The run was made by an older purerl: train it anew." if of_run else ""
         elif missing and (beside.is_dir() or beside.with_suffix(".py").exists()):
             hint = f"; it stands beside the file: set PYTHONPATH={place.parent}"
+        elif missing:
+            hint = "; install it, or correct its name"
+        hint = hint or meant(str(error), Config, Evaluation, Experiment)
         raise UserError(f"{file}{where}: {one_line(error)}{hint}") from error
 
 

@@ -1,10 +1,14 @@
-"""Does a JSON value fit a setting's annotation? What a folder says may be a stranger's."""
+"""Does a value fit a setting, a name one that there is? What a folder says may be a stranger's."""
 
+import dataclasses
 import enum
+import re
 import types
 import typing
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
+
+from purerl.core.errors import nearest
 
 
 def hints(kind: type) -> dict[str, Any]:
@@ -46,3 +50,14 @@ def fits(hint: Any, value: Any) -> bool:
 
 def _all_fit(hints: Any, values: list) -> bool:
     return len(hints) == len(values) and all(map(fits, hints, values))
+
+
+def meant(error: str, *kinds: type) -> str:
+    """Returns a hint where one of these dataclasses was called with a name that it lacks, or ""."""
+    found = re.search(r"(\w+)\.__init__\(\) got an unexpected keyword argument '(\w+)'", error)
+    known = {kind.__name__: dataclasses.fields(kind) for kind in kinds}
+    if not found or found[1] not in known:
+        return ""
+    names = [field.name for field in known[found[1]]]
+    near = nearest(found[2], names)
+    return f"; did you mean {near}?" if near else f"; there are: {', '.join(names)}"

@@ -18,6 +18,7 @@ from purerl.core.records import Metrics, PyTree, TrainState, count_as_int
 from purerl.devices.programs import Programs
 from purerl.ppo.config import Config, Evaluation
 from purerl.runs import checkpoint_folder, state_arrays
+from purerl.runs.check_env import lost_part
 from purerl.runs.loggers import MAX_SKIPPED_IN_A_ROW, Record, summarize
 from purerl.runs.writer import RunWriter
 
@@ -223,9 +224,9 @@ def _why_lost(state: TrainState, records: Sequence[Record], seed: int) -> str:
         return f"Parameters are not finite: {names}. Lower ppo.learning_rate."
     if math.isnan(record["train/reward"]):
         return (
-            "No step of an update was sound: of each, some number of the state is NaN or absurd. "
-            "`purerl.check_env(env)` tells which."
-        )
+            "No step of an update was sound: of each, some number of the state is NaN or absurd, "
+            f"which `purerl.check_env(env)` names. {lost_part(state.env)}"
+        ).strip()
     skipped = record["train/skipped_in_a_row"]
     if skipped < MAX_SKIPPED_IN_A_ROW:
         return ""

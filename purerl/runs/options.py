@@ -6,7 +6,15 @@ from typing import Annotated, Literal
 
 import tyro
 
+from purerl.core.errors import UserError
+
 Engine = Literal["auto", "c", "jax", "warp"]
+
+
+def check_seed(seed: int) -> None:
+    """Raises UserError for a seed that JAX would take for another one: it keeps 32 bits."""
+    if not 0 <= seed < 2**32:
+        raise UserError(f"seed is {seed}; it must be at least 0 and below 2**32.")
 
 
 @dataclass(frozen=True)
@@ -23,6 +31,10 @@ class PlayOptions:
     """Physics engine, where it should not be the run's own."""
     trust: bool = False
     """Execute the run's experiment.py though this machine does not know it: read it first."""
+
+    def __post_init__(self) -> None:
+        """Checks the rules."""
+        check_seed(self.seed)
 
 
 @dataclass(frozen=True)

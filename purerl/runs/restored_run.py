@@ -9,13 +9,14 @@ from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.records import TrainState
 from purerl.devices.programs import abstract_state
 from purerl.runs import checkpoint, checkpoint_folder, experiment, identity, manifest
-from purerl.runs.build_experiment import Setup, build, own_line, physics_hash
+from purerl.runs.build_experiment import Setup, build, physics_hash
 from purerl.runs.experiment import Experiment, Source
 from purerl.runs.files import check_is_run, check_memory, read_json
 from purerl.runs.loggers import Say
 from purerl.runs.run_folder import edited
 from purerl.runs.source_hashes import module_file, source_hashes
 from purerl.runs.trust import load_copy
+from purerl.runs.user_code import own_line
 
 
 class RestoredRun(NamedTuple):

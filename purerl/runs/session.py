@@ -45,6 +45,7 @@ from purerl.runs.lock import RunLock
 from purerl.runs.loggers import Say, check_loggers, open_loggers
 from purerl.runs.metrics_file import MetricsFile, Record, keep_whole_lines
 from purerl.runs.options import Options
+from purerl.runs.user_code import running
 from purerl.runs.writer import RunWriter
 
 NO_CHECKPOINT = {"update": 0, "metrics_bytes": 0, "metrics_sha256": hashlib.sha256().hexdigest()}
@@ -84,6 +85,7 @@ def execute(
             abstract = abstract_state(*setup[:3])
         begun_with = alone(lambda: _shards_on_disk(runs))
         shards = _choose_shards(setup.config, abstract, options, begun_with)
+        build_experiment.check_memory(setup, abstract, options.vmapped_seeds, shards.devices)
         plan = loop.make_plan(
             setup.config, chosen.evaluation, options.checkpoints, options.log_every
         )
@@ -232,7 +234,8 @@ def _train_together(job: _Job, folders: list[Path], seeds: list[int]) -> None:
                 stack.callback(writer.close)
                 writer.loggers = open_loggers(job.options, folder, meta["update"], say)
         stop = processes.agreed(job.stop)
-        loop.train(plan, programs, programs.spread(state), writers, progress, stop, meta)
+        with running():
+            loop.train(plan, programs, programs.spread(state), writers, progress, stop, meta)
         for folder, writer in zip(folders, writers, strict=True):
             of = f" of {folder.name}" if job.options.num_seeds > 1 else ""
             say(f"Done: {plan.steps:,} steps{of}. Digest {writer.digest}")

@@ -21,7 +21,7 @@ from purerl.runs.command_line import from_settings
 from purerl.runs.experiment import Experiment, Source, find_source
 from purerl.runs.files import check_name
 from purerl.runs.loaded_run import Run
-from purerl.runs.options import Options
+from purerl.runs.options import Options, check_seed
 from purerl.runs.trust import remember
 
 
@@ -85,6 +85,7 @@ def train_runs(
         check_name("name", options.name)
     place, runs = options.runs / source.name, {}
     for seed in range(chosen.seed, chosen.seed + options.num_seeds):
+        check_seed(seed)
         name = options.name or f"seed{seed}"
         if options.num_seeds > 1 and options.name:
             name += f"-seed{seed}"

@@ -543,7 +543,7 @@ def test_a_start_that_was_killed_half_way_can_be_made_again(tmp_path):
     [
         (["--resume"], "no run .* to resume"),
         (["--ppo.learing-rate", "1"], "Did you mean --ppo.learning-rate"),
-        (["--ppo.learning-rate", "fast"], "could not convert"),
+        (["--ppo.learning-rate", "fast"], "is 'fast'; it must be a number"),
         (["--ppo.num-steps", "31"], "num_steps is 31, less than one update"),
         (["--ppo.num-minibatches", "3"], "does not divide"),
         (["--keep", "0"], "keep is 0"),
