@@ -24,7 +24,7 @@ def size(tree: PyTree) -> int:
 
 def room() -> int:
     """Returns the bytes of memory of a device: of a GPU its own, of a CPU the machine's."""
-    known = jax.devices()[0].memory_stats() or {}
+    known = jax.local_devices()[0].memory_stats() or {}
     return known.get("bytes_limit") or os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
