@@ -15,6 +15,8 @@ from purerl import adapters, check_env
 from purerl.adapters import foreign
 from purerl.ppo.rollout import is_lost
 
+pytestmark = pytest.mark.slow
+
 MODEL = mujoco.MjModel.from_xml_string(
     "<mujoco><worldbody><body><joint type='slide' axis='1 0 0'/><geom size='.1'/></body>"
     "</worldbody></mujoco>"

@@ -20,6 +20,8 @@ from purerl import adapters
 from tests.golden import privileged
 from tests.test_readme import PAGES, blocks
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parent.parent.parent
 
 

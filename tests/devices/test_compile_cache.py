@@ -14,6 +14,8 @@ from hypothesis import given, strategies as st
 from purerl.devices import compilation, compile_cache
 from purerl.devices.compile_cache import MARK, CheckedPath
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parent.parent.parent
 # Two programs that are kept: where the code of one stands under the name of the other, JAX raises.
 SCRIPT = """

@@ -16,6 +16,8 @@ from purerl.devices import compilation
 from purerl.exact import xla_flags
 from purerl.runs import manifest, training
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 TOY = ROOT / "tests" / "runs" / "toy_experiment.py"
 # One run in peace, and one that is stopped half-way. Elsewhere the second may go on.

@@ -16,6 +16,8 @@ from purerl import exact
 from purerl.exact.portable import LibraryError
 from tests.exact import named
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 
 

@@ -57,6 +57,7 @@ def arrange(given: str, place: Path, trained: Path, monkeypatch) -> None:
         (place / "runs/mine/seed1/notes.txt").touch()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mistake", TABLE, ids=[f"{m.where}-{m.title}" for m in TABLE])
 def test_a_mistake_is_one_line(place, trained, monkeypatch, mistake):
     arrange(mistake.given, place, trained, monkeypatch)

@@ -20,6 +20,8 @@ from purerl.report.policy_file import Recorded, control_range, record_episodes
 from tests.golden import privileged, recurrent
 from tests.test_readme import PAGES, blocks
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parent.parent.parent
 PYTHON = blocks(PAGES["docs/export.md"].read_text(), "python")
 SLOW = pytest.mark.slow

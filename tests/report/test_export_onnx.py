@@ -15,6 +15,8 @@ onnxruntime = pytest.importorskip("onnxruntime")
 from purerl.report import onnx_nodes, policy_onnx  # noqa: E402
 from purerl.report.policy_function import PolicyFunction, policy_function  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 
 def computed(act, *arguments):
     """What onnxruntime makes of a function (observation, memory) -> (action, memory), [N, ...]."""

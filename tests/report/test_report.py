@@ -297,6 +297,7 @@ SHOWN = (
 )
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_clicks_change_the_page_and_nothing_complains(tmp_path):
     make_seeds(tmp_path / "runs", "a", [1.0, 2.0, 3.0])
@@ -328,6 +329,7 @@ def test_clicks_change_the_page_and_nothing_complains(tmp_path):
         assert all(url.startswith(("data:", "file:")) for url in browser.requested)
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_a_strangers_page_runs_no_script_of_his(tmp_path):
     read(tmp_path, strangers(tmp_path / "runs"))

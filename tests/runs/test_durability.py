@@ -99,6 +99,7 @@ def test_a_renamed_checkpoint_is_refused(stopped, capsys):
     assert "has been renamed" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["config.json", "manifest.json", "experiment.py"])
 def test_a_file_that_the_run_did_not_write_so_is_named(stopped, capsys, name):
     file = folder(stopped) / name
@@ -125,6 +126,7 @@ DAMAGE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DAMAGE)
 def test_metrics_that_the_run_did_not_write_are_refused(stopped, capsys, name, whole):  # noqa: F811
     file = folder(stopped) / "metrics.jsonl"
@@ -140,6 +142,7 @@ def test_metrics_that_the_run_did_not_write_are_refused(stopped, capsys, name, w
     assert lines(stopped) == lines(whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DAMAGE)
 def test_a_run_whose_metrics_were_lost_goes_on_when_told_to(stopped, capsys, name, whole):  # noqa: F811
     file = folder(stopped) / "metrics.jsonl"
@@ -175,6 +178,7 @@ def test_leaves_that_look_alike_stay_apart():
 # --- what has no checkpoint ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [[], ["--resume"]])
 def test_a_mistake_found_late_does_not_block_its_own_correction(tmp_path, whole, stop_after, more):  # noqa: F811
     stop_after(0)
@@ -217,6 +221,7 @@ def no_memory(monkeypatch):
     monkeypatch.setattr(array_files, "read", refuse)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", [no_orbax, too_many_files, no_memory])
 def test_a_fault_in_reading_puts_nothing_aside(stopped, whole, monkeypatch, capsys, fault):  # noqa: F811
     before = content(folder(stopped))
@@ -264,6 +269,7 @@ def test_one_failure_to_save_is_made_good_at_once(tmp_path, whole, monkeypatch, 
     assert lines(tmp_path) == lines(whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [7_200.0, -7_200.0, 30 * 365 * 86_400.0])
 def test_a_clock_that_is_set_changes_nothing(tmp_path, whole, monkeypatch, step):  # noqa: F811
     clock, calls = time.time, []

@@ -16,6 +16,8 @@ from purerl import compare, evaluate, run
 from purerl.core.errors import FAILURE, SUCCESS, USAGE
 from purerl.runs import checkpoint_folder, files
 
+pytestmark = pytest.mark.slow
+
 TOY = Path(__file__).parent / "toy_experiment.py"
 FEW = ["--episodes", "1"]
 

@@ -18,6 +18,8 @@ from purerl.report import opengl
 from purerl.runs import command_errors, output
 from tests.runs.test_run import ROOT, TOY, digest, folder, whole  # noqa: F401
 
+pytestmark = pytest.mark.slow
+
 
 def shell(line: str, *words: str) -> subprocess.CompletedProcess:
     """Runs a command of purerl; in `line`, "$@" is it with its `words`."""
