@@ -7,6 +7,7 @@ One fact a line. Lines of `machine` may differ. If no line of `version` or `libr
 `operation` (which finds where bits part) and of `run` (a digest of each golden run) may.
 """
 
+import functools
 import hashlib
 import os
 import platform
@@ -103,7 +104,9 @@ def operations() -> Iterator[str]:
     matrix = np.tril(numbers(40, 40)) / 64  # numpy's products would be another library's
     matrix = matrix + matrix.T + 9 * np.eye(40, dtype=np.float32)
     yield f"operation cholesky {digest(jnp.linalg.cholesky, matrix)}"
-    yield f"operation solve {digest(jnp.linalg.solve, matrix, matrix[0])}"
+    yield f"operation qr {digest(lambda x: jnp.linalg.qr(x)[0], matrix)}"
+    solve = functools.partial(jax.scipy.linalg.solve_triangular, lower=True)
+    yield f"operation triangular_solve {digest(solve, matrix, matrix[0])}"
 
 
 def numbers(*shape: int) -> np.ndarray:
