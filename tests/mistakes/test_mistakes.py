@@ -48,7 +48,7 @@ def arrange(given: str, place: Path, trained: Path, monkeypatch) -> None:
         monkeypatch.setenv("MUJOCO_GL", "glfw")
     if given.startswith("no "):
         find, absent = importlib.util.find_spec, given.removeprefix("no ")
-        found = lambda name, *of: None if name == absent else find(name, *of)  # noqa: E731
+        found = lambda name, *of: None if name.startswith(absent) else find(name, *of)  # noqa: E731
         monkeypatch.setattr("importlib.util.find_spec", found)
     if given == "4 GB of memory":
         monkeypatch.setattr(memory, "room", lambda: 4_000_000_000)
