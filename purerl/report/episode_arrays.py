@@ -87,6 +87,8 @@ def record(setup: Setup, state: TrainState, seed: int, number: int) -> Leaves:
     rows = played(state, key)
     now = rows.pop("state")
     rows |= {name: getattr(now, name) for name in ("observation", "physics", "metrics", "task")}
-    arrays = {name: np.swapaxes(x, 0, 1) for name, x in flatten(rows).items() if x.size}
+    # Names of modules and metrics may have slashes of their own, which stay as they are.
+    leaves = {name.replace("~1", "/"): x for name, x in flatten(rows).items() if x.size}
+    arrays = {name: np.swapaxes(x, 0, 1) for name, x in leaves.items()}
     length = arrays.pop("running").sum(axis=1)
     return {"length": length} | {name: x[:, : length.max()] for name, x in arrays.items()}
