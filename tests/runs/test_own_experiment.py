@@ -225,12 +225,12 @@ def test_lost_episodes_are_told(place, capsys):
 
 
 @pytest.mark.slow
-def test_a_run_whose_checkpoints_are_gone_says_that_it_begins_anew(place, capsys):
+def test_a_run_whose_checkpoints_are_gone_does_not_begin_anew(place, capsys):
     assert train(place) == errors.SUCCESS
     shutil.rmtree(place / "runs" / "mine" / "seed1" / "checkpoints")
     capsys.readouterr()
-    assert train(place, "--resume") == errors.SUCCESS
-    assert "There is no checkpoint in" in capsys.readouterr().out
+    assert train(place, "--resume") == errors.USAGE
+    assert "there is nothing to go on from" in capsys.readouterr().err
 
 
 def test_a_folder_of_runs_lists_them(place, capsys):
