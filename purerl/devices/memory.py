@@ -25,7 +25,12 @@ def size(tree: PyTree) -> int:
 def room() -> int:
     """Returns the bytes of memory of a device: of a GPU its own, of a CPU the machine's."""
     known = jax.local_devices()[0].memory_stats() or {}
-    return known.get("bytes_limit") or os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return known.get("bytes_limit") or of_machine()
+
+
+def of_machine() -> int:
+    """Returns the bytes of the machine's own memory."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def least(config: Config, abstract: PyTree, action_size: int) -> dict[str, int]:

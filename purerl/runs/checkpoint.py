@@ -20,7 +20,14 @@ import numpy as np
 from purerl.core.errors import UserError, one_line
 from purerl.core.records import PyTree
 from purerl.runs import array_files, checkpoint_folder
-from purerl.runs.checkpoint_folder import META, WRITING, DamagedError, load_meta, path_of, verify
+from purerl.runs.checkpoint_folder import (
+    META,
+    WRITING,
+    DamagedError,
+    check_files,
+    load_meta,
+    path_of,
+)
 from purerl.runs.files import hash_files, sync, sync_tree
 from purerl.runs.identity import Owner, check_owner
 from purerl.runs.state_arrays import Leaves, digest_leaves, leaf_paths, raw, unflatten
@@ -83,7 +90,7 @@ def load(path: Path, abstract: PyTree, owners: Sequence[Owner] = ()) -> Saved:
     meta = load_meta(path)
     check_owner(path, meta, owners)
     wanted = _check_fits(path, meta, abstract)
-    verify(path)
+    check_files(path, meta)
     leaves = {key: np.zeros(shape, jnp.dtype(dtype)) for key, (dtype, shape) in wanted.items()}
     try:
         leaves |= array_files.read(path / "state", {k: x for k, x in leaves.items() if x.size})

@@ -87,8 +87,8 @@ def hash_meta(meta: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(meta, sort_keys=True).encode()).hexdigest()
 
 
-def verify(path: Path) -> dict[str, Any]:
-    """Returns a checkpoint's metadata after comparing every file with its hash.
+def check_files(path: Path, meta: dict[str, Any]) -> None:
+    """Compares every file of a checkpoint with its hash in the metadata.
 
     Raises:
       DamagedError: a file is not what was written.
@@ -96,7 +96,6 @@ def verify(path: Path) -> dict[str, Any]:
     """
     with reading(path):
         check_plain(path)
-    meta = load_meta(path)
     if path_of(path.parent, meta["update"]) != path and path.name.isdigit():
         raise UserError(
             f"The checkpoint {path} is of update {meta['update']}: it has been renamed. Name it "
@@ -109,7 +108,6 @@ def verify(path: Path) -> dict[str, Any]:
             found = hash_file(path / name)
         if found != expected:
             raise DamagedError(f"{name} is not what was written (sha256 differs)")
-    return meta
 
 
 def updates(folder: Path) -> list[int]:
@@ -217,7 +215,9 @@ def take_back(folder: Path, say: Callable[[str], None]) -> None:
         if path.exists():
             continue
         with contextlib.suppress(DamagedError, UserError):
-            if path_of(folder, verify(kept)["update"]) == path:
+            meta = load_meta(kept)
+            check_files(kept, meta)
+            if path_of(folder, meta["update"]) == path:
                 kept.rename(path)
                 sync(folder)
                 say(f"{kept} is whole after all: it is the checkpoint {path} again.")

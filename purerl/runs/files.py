@@ -236,16 +236,6 @@ def check_inside(folder: Path, path: Path) -> None:
         raise UserError(f"{path} is a link that leaves the run's folder: put a copy there instead.")
 
 
-def check_memory(folder: Path, size: int) -> None:
-    """Raises UserError if this machine has no room to read a state of `size` bytes."""
-    room = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if 2 * size > room:  # a reader holds it twice
-        raise UserError(
-            f"The state of {folder} takes {size / 1e9:,.0f} GB, by its config.json; this machine "
-            f"has {room / 1e9:,.0f} GB of memory."
-        )
-
-
 def check_no_links(folder: Path) -> None:
     """Raises UserError if a run that goes on would write through a link: it writes in its folder.
 

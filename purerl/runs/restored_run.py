@@ -3,15 +3,14 @@
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
-
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.records import TrainState
+from purerl.devices import memory
 from purerl.devices.programs import abstract_state
 from purerl.runs import checkpoint, checkpoint_folder, experiment, identity, manifest
 from purerl.runs.build_experiment import Setup, build, physics_hash
 from purerl.runs.experiment import Experiment, Source
-from purerl.runs.files import check_is_run, check_memory, read_json
+from purerl.runs.files import check_is_run, read_json
 from purerl.runs.loggers import Say
 from purerl.runs.run_folder import edited
 from purerl.runs.source_hashes import module_file, source_hashes
@@ -64,8 +63,17 @@ def restore(
         say(f"Edited since the run: {what}.")
     abstract = abstract_state(*setup[:3])
     abstract = abstract.replace(env=None, episode=None, optimizer=None)
-    check_memory(folder, sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(abstract)))
+    _check_memory(folder, memory.size(abstract))
     return RestoredRun(chosen, setup, _choose(folder / "checkpoints", update, abstract, say, begun))
+
+
+def _check_memory(folder: Path, size: int) -> None:
+    """Raises UserError if this machine has no room to read a state of `size` bytes."""
+    if 2 * size > (room := memory.of_machine()):  # a reader holds it twice
+        raise UserError(
+            f"The state of {folder} takes {size / 1e9:,.0f} GB, by its config.json; this machine "
+            f"has {room / 1e9:,.0f} GB of memory."
+        )
 
 
 def _changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[str]:
