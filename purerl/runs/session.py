@@ -39,6 +39,7 @@ from purerl.runs import (
     run_folder,
 )
 from purerl.runs.command_errors import tell
+from purerl.runs.build_experiment import Setup
 from purerl.runs.experiment import Experiment, Source
 from purerl.runs.files import read_json, write_json
 from purerl.runs.lock import RunLock
@@ -90,14 +91,7 @@ def execute(
             setup.config, chosen.evaluation, options.checkpoints, options.log_every
         )
         schedule = {"log_every": plan.log_every, "checkpoints": options.checkpoints}
-        builders = (chosen.build_env, chosen.build_network)
-        kernels = exact.how_chosen(jax.default_backend())
-        facts = manifest.collect(setup.engine, builders, kernels, shards.number)
-        facts["model"] = build_experiment.physics_hash(setup.env)
-        facts["experiment_file"] = str(source.path)
-        if options.vmapped_seeds > 1:
-            facts["vmapped_seeds"] = {"first": chosen.seed, "number": options.vmapped_seeds}
-
+        facts = _facts(source, chosen, options, setup, shards)
         locks: dict[Path, RunLock] = {}
 
         @run_folder.refusals()
@@ -126,11 +120,25 @@ def execute(
                     calls_host=setup.engine == "c",
                 )  # fmt: skip
             if jax.default_backend() == "gpu" and processes.is_first():
-                exactness = manifest.exactness(setup.engine, kernels, made.unordered)
+                exactness = manifest.exactness(setup.engine, facts["kernels"], made.unordered)
                 _tell_unordered(runs, exactness, made.unordered)
             return made
 
         _train_all(runs, _Job(options, plan, programs, abstract, locks, stop))
+
+
+def _facts(
+    source: Source, chosen: Experiment, options: Options, setup: Setup, shards: Shards
+) -> dict[str, Any]:
+    """Returns what manifest.json says of a run that begins now."""
+    builders = (chosen.build_env, chosen.build_network)
+    kernels = exact.how_chosen(jax.default_backend())
+    facts = manifest.collect(setup.engine, builders, kernels, shards.number)
+    facts["model"] = build_experiment.physics_hash(setup.env)
+    facts["experiment_file"] = str(source.path)
+    if options.vmapped_seeds > 1:
+        facts["vmapped_seeds"] = {"first": chosen.seed, "number": options.vmapped_seeds}
+    return facts
 
 
 def _tell_unordered(folders: Iterable[Path], exactness: dict[str, Any], places: list[str]) -> None:

@@ -16,10 +16,10 @@ from typing import Any
 
 import jax
 
-from purerl.devices import programs
+from purerl.devices import memory, programs
 from purerl.devices.compilation import set_up_jax
 from purerl.ppo import algorithm
-from purerl.runs import build_experiment, checkpoint, console, experiment, state_arrays
+from purerl.runs import build_experiment, checkpoint, experiment, state_arrays
 from purerl.runs.command_line import from_command_line
 
 TIMES = 5
@@ -53,7 +53,7 @@ def main() -> None:
         restored, restores = median(lambda: checkpoint.load(path, abstract).state)
         assert state_arrays.digest_leaves(state_arrays.flatten(restored)) == meta["digest"]
         on_disk = sum(f.stat().st_size for f in path.rglob("*") if f.is_file())
-    print(f"state     {console.size(state):>12,} bytes in {len(leaves)} leaves")
+    print(f"state     {memory.size(state):>12,} bytes in {len(leaves)} leaves")
     print(f"on disk   {on_disk:>12,} bytes")
     for name, seconds in (("holds up", holds_up), ("writes", writes), ("restores", restores)):
         print(f"{name:9} {seconds:12.4f} s")
