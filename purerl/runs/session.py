@@ -38,8 +38,8 @@ from purerl.runs import (
     output,
     run_folder,
 )
-from purerl.runs.command_errors import tell
 from purerl.runs.build_experiment import Setup
+from purerl.runs.command_errors import tell
 from purerl.runs.experiment import Experiment, Source
 from purerl.runs.files import read_json, write_json
 from purerl.runs.lock import RunLock
