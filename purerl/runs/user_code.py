@@ -101,6 +101,8 @@ def running() -> Iterator[None]:
     """
     try:
         yield
+    except (RunError, UserError):  # told already: of a full disk, by the words of a full memory
+        raise
     except Exception as error:
         said = str(error)
         if "RESOURCE_EXHAUSTED" in said or "ut of memory" in said:
@@ -113,7 +115,7 @@ def running() -> Iterator[None]:
         frames = re.findall(r'"(.+?)", line (\d+)', said)
         ours = [i for i, frame in enumerate(frames) if _OTHERS[-1] in frame[0]]
         where = _last_own(frames[max(ours, default=0) :]) if lines else own_line(error)
-        if isinstance(error, RunError | UserError) or not (lines or where):
+        if not (lines or where):
             raise
         dispatch.runtime_tokens.clear()  # or JAX tells it again, with tracebacks, at the end
         what = lines[-1] if lines else one_line(error)
