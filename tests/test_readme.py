@@ -15,7 +15,7 @@ import pytest
 import purerl
 
 ROOT = Path(__file__).parent.parent
-PAGES = {str(p.relative_to(ROOT)): p for p in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]}
+PAGES = {str(p.relative_to(ROOT)): p for p in [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]}
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?:^    .+\n)+", re.MULTILINE)
 INLINE = re.compile(r"`([^`]+)`")
@@ -178,7 +178,7 @@ def test_every_room_is_in_the_map(name):
 def test_the_index_lists_every_page():
     index = PAGES["docs/README.md"]
     listed = {(index.parent / link).resolve() for link in LINK.findall(index.read_text())}
-    assert {path.resolve() for path in (ROOT / "docs").glob("*.md")} - {index} <= listed
+    assert {path.resolve() for path in (ROOT / "docs").rglob("*.md")} - {index} <= listed
 
 
 def test_the_version_is_one():

@@ -6,7 +6,7 @@ May import: core, ppo, physics. Read: `stepping.py`, then the file of the librar
   dm_env_environment(env): for `dm_env`.
   from_brax(BraxOptions(name)), from_playground(PlaygroundOptions(name)): their environments for us.
 
-A name is imported when it is first used: each needs its library. docs/adapters.md shows all.
+A name is imported when it is first used: each needs its library. docs/howto/adapters.md shows all.
 """
 
 import importlib
