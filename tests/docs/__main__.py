@@ -16,9 +16,11 @@ def main() -> None:
     for name, path in pages().items():
         for block in blocks(path.read_text()):
             written += bool(block.title)
-            ran += block.runs and not block.title
+            ran += block.runs and not block.title and not block.lacks
             if block.language in EXECUTED and block.marker == "not run":
                 left.append(f"  {name}:{block.line}: {block.words}")
+            elif block.lacks:
+                left.append(f"  {name}:{block.line}: {', '.join(block.lacks)} is not installed")
     print(f"blocks executed: {ran}; written to files: {written}; not executed: {len(left)}")
     print(*left, sep="\n")
 

@@ -1,10 +1,14 @@
 """The code blocks of the pages, and what a page says about running them.
 
 Directly above a block may stand `<!-- not run: REASON -->`, or, above bash,
-`<!-- run with: WORDS -->`: these words are added to the block's last command. A block with
+`<!-- run with: WORDS -->`: these words are added to the block's last command, or
+`<!-- needs: MODULE ... -->`: without these modules the block is left out. A block with
 `title="FILE"` after its language is written to that file instead of executed.
+
+`<!-- given: FOLDER -->` anywhere in a page: it begins with that run of the cart-pole in its folder.
 """
 
+import importlib.util
 import re
 import textwrap
 from pathlib import Path
@@ -14,7 +18,8 @@ ROOT = Path(__file__).parent.parent.parent
 EXECUTED = ("bash", "python")
 SHOWN = ("diff", "json", "text", "toml", "xml", "yaml")
 FENCE = re.compile(r"^( *)```(.*)$")
-MARKER = re.compile(r"^ *<!-- (not run|run with): (\S.*?) *-->$")
+MARKER = re.compile(r"^ *<!-- (not run|run with|needs): (\S.*?) *-->$")
+GIVEN = re.compile(r"^<!-- given: (\S+) -->$", re.MULTILINE)
 TITLE = re.compile(r'^title="([\w./-]+)"$')
 COMMENT = re.compile(r"\s+#[^'\"]*$")
 
@@ -25,13 +30,20 @@ class Block(NamedTuple):
     line: int  # of the first line of code, from 1
     language: str
     title: str  # of the file to write, or nothing
-    marker: str  # "not run", "run with" or nothing
+    marker: str  # "not run", "run with", "needs" or nothing
     words: str  # of the marker
     code: str
 
     @property
     def runs(self) -> bool:
+        """Tells whether it is executed, or written, where the modules that it needs are."""
         return self.language in EXECUTED and self.marker != "not run"
+
+    @property
+    def lacks(self) -> list[str]:
+        """Returns the modules that it needs and that are not here."""
+        needed = self.words.split() if self.marker == "needs" else []
+        return [name for name in needed if importlib.util.find_spec(name) is None]
 
 
 def pages() -> dict[str, Path]:
@@ -78,7 +90,7 @@ def lone_markers(text: str) -> list[int]:
     return [
         number + 1
         for number, line in enumerate(lines)
-        if re.match(r" *<!-- *(not run|run with)", line)
+        if re.match(r" *<!-- *(not run|run with|needs)", line)
         and not (MARKER.match(line) and FENCE.match([*lines, ""][number + 1]))
     ]
 

@@ -3,15 +3,18 @@
 `run` gives a page an empty folder and a process of its own.
 """
 
+import atexit
+import functools
 import importlib
 import os
+import shutil
 import stat
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-from tests.docs.blocks import ROOT, Block, blocks, command
+from tests.docs.blocks import GIVEN, ROOT, Block, blocks, command
 
 # What is compiled for one page serves the next, and the tests.
 COMPILED = os.path.join(tempfile.gettempdir(), "purerl-test-compilations")
@@ -31,10 +34,26 @@ def run(page: Path, timeout: float = 290.0) -> subprocess.CompletedProcess[str]:
         }
         environment.setdefault("JAX_COMPILATION_CACHE_DIR", COMPILED)
         environment.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+        for given in GIVEN.findall(page.read_text()):
+            shutil.copytree(_trained(), work / given)
         words = [sys.executable, "-m", "tests.docs.play", str(page.resolve())]
         return subprocess.run(
             words, cwd=work, env=environment, text=True, timeout=timeout, capture_output=True
         )
+
+
+@functools.cache
+def _trained() -> Path:
+    """Trains the cart-pole for some seconds, once for all pages; returns the run's folder."""
+    place = Path(tempfile.mkdtemp(prefix="purerl-page-run-"))
+    atexit.register(shutil.rmtree, place, ignore_errors=True)
+    words = ["cartpole_swingup", "--ppo.num-steps", "40000", "--runs", str(place)]
+    words += ["--evaluation.number", "2", "--evaluation.num-episodes", "4"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment.setdefault("JAX_COMPILATION_CACHE_DIR", COMPILED)
+    command = [sys.executable, "-m", "purerl.run", *words]
+    subprocess.run(command, check=True, env=environment, cwd=place, capture_output=True)
+    return place / "cartpole_swingup" / "seed1"
 
 
 def _write_commands(folder: Path) -> None:
@@ -51,7 +70,7 @@ def play(page: Path) -> None:
     sys.path[0] = ""  # the present folder, wherever a block goes
     names = {"__name__": "__main__"}
     for block in blocks(page.read_text()):
-        if block.marker == "not run":
+        if block.marker == "not run" or block.lacks:
             continue
         if block.title:
             write(block)
