@@ -1,14 +1,22 @@
-"""Prints which blocks of the pages are executed; `python -m tests.docs PAGE...` executes pages."""
+"""Prints which blocks of the pages are executed.
+
+`python -m tests.docs PAGE...` executes pages; `--write` writes those that are made from the code.
+"""
 
 import sys
 import time
 from pathlib import Path
 
+from tests.docs import generated
 from tests.docs.blocks import EXECUTED, ROOT, blocks, pages
 from tests.docs.play import run
 
 
 def main() -> None:
+    if sys.argv[1:] == ["--write"]:
+        for path, page in generated.PAGES.items():
+            path.write_text(page())
+        return
     if sys.argv[1:]:
         sys.exit(max(_executed(Path(name)) for name in sys.argv[1:]))
     ran = written = 0
