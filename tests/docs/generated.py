@@ -22,16 +22,16 @@ SETTINGS = ROOT / "docs/reference/settings.md"
 HELP = ROOT / "docs/reference/options.md"
 SETTINGS_HEAD = """# Settings
 
-`python -m tests.docs --write` writes this page from the code. `python -m purerl.run EXPERIMENT --help`
-lists all settings of an experiment, its environment's too, with its own values.
+`python -m tests.docs --write` writes this page from the code. All settings of an experiment, those
+of its environment too, are listed with its own values: `python -m purerl.run ant_run --help`.
 
-A setting has one name: `ppo.gamma` in Python and in `config.json`, `--ppo.gamma` on the command line.
-What has no default here is the experiment's to say.
+A setting has one name: `ppo.gamma` in Python and in `config.json`, `--ppo.gamma` on the command
+line. What has no default here is the experiment's to say.
 """
 HELP_HEAD = """# Options of the commands
 
-`python -m tests.docs --write` writes this page from the code: it is what `--help` of each command says.
-[Commands](commands.md) is the overview.
+`python -m tests.docs --write` writes this page from the code: it is what `--help` of each command
+says. [Commands](commands.md) is the overview.
 """
 TABLES = {
     "ppo": (config.Config, "The algorithm. [The equations](../explanation/episodes.md) use these."),
@@ -68,9 +68,13 @@ def help_of(command: str, *words: str) -> str:
     """Returns what `--help` of a command prints, 92 wide and without colours."""
     said = io.StringIO()
     plain = {"COLUMNS": "92", "NO_COLOR": "1", "TERM": "dumb"}
-    with mock.patch.dict(os.environ, plain), contextlib.redirect_stdout(said):
-        with contextlib.suppress(SystemExit):
-            importlib.import_module(f"purerl.{module_of(command)}").main([*words, "--help"])
+    module = importlib.import_module(f"purerl.{module_of(command)}")
+    with (
+        mock.patch.dict(os.environ, plain),
+        contextlib.redirect_stdout(said),
+        contextlib.suppress(SystemExit),
+    ):
+        module.main([*words, "--help"])
     return "\n".join(line.rstrip() for line in said.getvalue().strip().splitlines())
 
 
