@@ -9,7 +9,7 @@ import numpy as np
 from purerl.core.errors import UserError
 from purerl.runs.output import printable
 from purerl.sweep.spaces import Space
-from purerl.sweep.table import Row, by_value
+from purerl.sweep.table import Row, by_value, is_number
 
 COLUMNS = 3
 SPREAD = 10.0  # of listed values, largest / smallest, from which their axis is logarithmic
@@ -19,12 +19,7 @@ def has_log_axis(space: Space, values: Sequence[Any]) -> bool:
     """Tells whether a setting is shown on a logarithmic axis."""
     if not space.choices:
         return space.log
-    numbers = _are_numbers(values)
-    return numbers and min(values) > 0 and max(values) >= SPREAD * min(values)
-
-
-def _are_numbers(values: Sequence[Any]) -> bool:
-    return not any(by_value(value)[0] for value in values)
+    return all(map(is_number, values)) and min(values) > 0 and max(values) >= SPREAD * min(values)
 
 
 def draw(path: Path, rows: Sequence[Row], spaces: Sequence[Space], metric: str) -> bool:
@@ -32,7 +27,7 @@ def draw(path: Path, rows: Sequence[Row], spaces: Sequence[Space], metric: str) 
 
     Args:
       path: the PNG.
-      rows: the points.
+      rows: the points, the best one first.
       spaces: the swept settings, each a panel.
       metric: the score's name.
     """
@@ -58,7 +53,10 @@ def draw(path: Path, rows: Sequence[Row], spaces: Sequence[Space], metric: str) 
         panel.set_axis_off()
     for panel in axes[:, 0]:
         panel.set_ylabel(printable(metric))
-    axes.flat[0].legend(fontsize="small")
+    handles = max(
+        (panel.get_legend_handles_labels() for panel in axes.flat), key=lambda x: len(x[0])
+    )
+    figure.legend(*handles, loc="outside lower center", ncols=4, fontsize="small")
     try:
         figure.savefig(path, dpi=120)
     except OSError as error:
@@ -72,8 +70,8 @@ def _draw_panel(panel: Any, rows: Sequence[Row], space: Space) -> None:
     """Draws a point's seeds, its IQM and interval; the line joins the medians of each value."""
     values = [row.typed[space.setting] for row in rows]
     names = sorted({str(value): value for value in values}.values(), key=by_value)
-    is_number = _are_numbers(values)
-    place = [float(v) if is_number else float(names.index(v)) for v in values]
+    numbers = all(map(is_number, values))
+    place = [float(v) if numbers else float(names.index(v)) for v in values]
     iqms = [row.summary["iqm"] for row in rows]
     both = list(zip(place, rows, strict=True))
     seeds = [(x, y) for x, row in both for y in row.summary["runs"].values()]
@@ -83,8 +81,8 @@ def _draw_panel(panel: Any, rows: Sequence[Row], space: Space) -> None:
             ends = row.summary["interval"]
             panel.plot([x, x], [ends["low"], ends["high"]], color="C0", linewidth=1.5, alpha=0.5)
     panel.plot(place, iqms, "o", color="C0", markersize=6, label="IQM of a point, 95% interval")
-    best = int(np.argmax(iqms))
-    panel.plot(place[best], iqms[best], "o", color="C1", markersize=9, label="best point")
+    if rows[0].status == "done":
+        panel.plot(place[0], iqms[0], "o", color="C1", markersize=9, label="best point")
     different = sorted(set(place))
     if space.choices and len(different) < len(place):
         medians = [np.median([y for x, y in zip(place, iqms, strict=True) if x == one])
@@ -92,12 +90,14 @@ def _draw_panel(panel: Any, rows: Sequence[Row], space: Space) -> None:
         panel.plot(different, medians, color="C0", linewidth=1, label="median of the points")
     panel.set_xlabel(printable(space.setting))
     panel.grid(alpha=0.3)
-    if is_number and has_log_axis(space, values):
+    if numbers and has_log_axis(space, values):
         panel.set_xscale("log")
-    if not is_number or (space.choices and len(names) <= 8):  # the values themselves, no others
+    if not numbers or (space.choices and len(names) <= 8):  # the values themselves, no others
         panel.set_xticks(different, [_label(name) for name in names])
         panel.minorticks_off()
 
 
 def _label(value: Any) -> str:
+    if isinstance(value, tuple | list):
+        return " ".join(map(_label, value))
     return f"{value:.4g}" if isinstance(value, float) else printable(str(value))[:24]

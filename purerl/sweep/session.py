@@ -149,9 +149,10 @@ class _Progress:
             score = table.summarize(group, metric)["iqm"]
         if self.study is not None and result.status != "stopped":
             study.tell(self.study, point, score)
-        shown = f"{score:.6g}" if score is not None else result.said
+        shown = f": {result.said}" if score is None and result.said else ""
+        shown = f": {score:.6g}" if score is not None else shown
         count = f"{len(self.results)} of {self.number}"
-        say(f"{point.name}  {result.status:8} {self._values(result.job)}: {shown}  ({count})")
+        say(f"{point.name}  {result.status:8} {self._values(result.job)}{shown}  ({count})")
 
     def _values(self, job: Job) -> str:
         return " ".join(f"{n}={v}" for n, v in self.points[job.name].values.items())

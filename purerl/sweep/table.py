@@ -63,14 +63,22 @@ def _rank(row: Row) -> tuple[Any, ...]:
     return (place, -(score or 0.0), *map(by_value, row.typed.values()), row.point.number)
 
 
-def by_value(value: Any) -> tuple[bool, float, str]:
-    """Returns a key that sorts numbers as numbers, and others after them as text.
+def by_value(value: Any) -> tuple[int, tuple[float, ...], str]:
+    """Returns a key that sorts numbers as numbers, then rows of them, then others as text.
 
-    >>> sorted([10, 9, "a", 8.5], key=by_value)
-    [8.5, 9, 10, 'a']
+    >>> sorted([10, (16, 8), (8, 16), 9, "a", 8.5], key=by_value)
+    [8.5, 9, 10, (8, 16), (16, 8), 'a']
     """
-    is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    return (not is_number, float(value) if is_number else 0.0, str(value))
+    if is_number(value):
+        return 0, (float(value),), ""
+    if isinstance(value, tuple | list) and all(map(is_number, value)):
+        return 1, tuple(map(float, value)), ""
+    return 2, (), str(value)
+
+
+def is_number(value: Any) -> bool:
+    """Tells whether a setting's value is a number; true and false are none."""
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)
 
 
 def as_record(row: Row) -> dict[str, Any]:
