@@ -1,10 +1,12 @@
 """The control suite's scores: what counts, what is read back, what is ahead of whom."""
 
+import argparse
+
 import numpy as np
 import pytest
 
 from envs.suite.tasks import TASKS
-from experiments.benchmarks import suite_pictures, suite_scores
+from experiments.benchmarks import suite_benchmark, suite_pictures, suite_scores
 from experiments.benchmarks.suite_scores import Seed
 
 
@@ -71,6 +73,18 @@ def test_every_published_task_has_our_name():
     assert published["cheetah-run"]["brax_ppo_end"] == 829
     assert "tdmpc2_4M" not in published["point_mass-easy"]  # an empty cell
     assert len(published.keys() & TASKS.keys()) >= 18
+
+
+def test_a_seed_that_never_had_a_folder_counts_as_failed():
+    asked = argparse.Namespace(tasks=["cheetah-run", "hopper-hop"], first_seed=1, seeds=3)
+    missing = suite_benchmark.never_begun(asked, SEEDS)
+    assert [(s.task, s.seed, s.status, s.score) for s in missing] == []
+    missing = suite_benchmark.never_begun(asked, [s for s in SEEDS if s.seed != 2])
+    assert [(s.task, s.seed, s.score) for s in missing] == [
+        ("cheetah-run", 2, 0.0),
+        ("hopper-hop", 2, 0.0),
+    ]
+    assert len(suite_scores.by_task(missing)["hopper-hop"]) == 1
 
 
 @pytest.mark.slow
