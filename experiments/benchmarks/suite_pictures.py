@@ -33,9 +33,10 @@ def draw_tasks(
       across: "steps" or "seconds".
     """
     pyplot = _pyplot()
-    rows = math.ceil(len(tasks) / COLUMNS)
+    columns = min(COLUMNS, len(tasks))
+    rows = math.ceil(len(tasks) / columns)
     figure, panels = pyplot.subplots(
-        rows, COLUMNS, figsize=(3 * COLUMNS, 2.2 * rows), sharey=True, squeeze=False,
+        rows, columns, figsize=(3 * columns, 2.2 * rows), sharey=True, squeeze=False,
         layout="constrained",
     )  # fmt: skip
     for panel in panels.flat[len(tasks) :]:
