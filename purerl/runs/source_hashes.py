@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 PACKAGE = Path(__file__).parent.parent
-AFTERWARDS = {"report"}  # rooms that only look at what a run has written
+AFTERWARDS = {"report", "sweep"}  # rooms that only start runs, or look at what one has written
 
 
 def source_hashes(builders: Iterable[Callable], package: Path = PACKAGE) -> dict[str, str]:
