@@ -154,16 +154,6 @@ def test_python_blocks_import_the_front_door_alone(page):
                 assert node.attr in purerl.__all__
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["README.md", "docs/using.md"])
-def test_python_blocks_run(name, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    found = blocks(PAGES[name].read_text(), "python")
-    assert found
-    for number, block in enumerate(found):
-        exec(compile(block, f"{name}, block {number}", "exec"), {})
-
-
 def test_readme_has_two_screens():
     lines = PAGES["README.md"].read_text().splitlines()
     assert len(lines) <= 120

@@ -1,4 +1,4 @@
-"""An extension of griffe (`mkdocs.yml`): what a docstring shows by `>>>` is an example, not text."""
+"""An extension of griffe (`mkdocs.yml`): what a docstring shows by `>>>` is an example."""
 
 import re
 import textwrap

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import purerl
+from purerl.__main__ import COMMANDS
 from tests.docs import generated, notebook, site
 from tests.docs.blocks import ROOT, blocks, pages
 
@@ -62,6 +63,11 @@ def test_every_public_name_has_its_docstring_in_the_reference():
         asked |= set(site.DOCSTRING.findall(path.read_text()))
     # Packages with pages of their own, and names of types.
     assert asked == set(purerl.__all__) - {"adapters", "exact", "Array", "PyTree"}
+
+
+def test_every_command_is_in_the_overview():
+    overview = (DOCS / "reference/commands.md").read_text()
+    assert not [name for name in COMMANDS if f"| `purerl.{name}` |" not in overview]
 
 
 def test_settings_are_written_from_the_code():
