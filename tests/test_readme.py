@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import purerl
+from purerl.__main__ import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 PAGES = {str(p.relative_to(ROOT)): p for p in [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]}
@@ -66,10 +67,9 @@ def help_page(*words):
 
 @functools.cache
 def all_help():
-    """Returns the help pages of all our commands, those of `run` for two experiments."""
-    pages = [help_page("purerl.run", name) for name in ("ant_gaps", "suite")]
-    names = ("evaluate", "render", "compare", "record", "export", "report", "plot")
-    return "".join([*pages, *(help_page(f"purerl.{name}") for name in names)])
+    """Returns the help pages of all our commands, those of `run` for some experiments."""
+    pages = [help_page("purerl.run", name) for name in ("ant_gaps", "custom_network", "suite")]
+    return "".join([*pages, *(help_page(f"purerl.{n}") for n in COMMANDS if n != "run")])
 
 
 def unknown_options(words):
