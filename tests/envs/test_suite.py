@@ -258,7 +258,15 @@ def test_the_command_names_the_nearest_task(capsys):
     assert len(said.strip().splitlines()) == 1
 
 
-@pytest.mark.parametrize("name", ["humanoid-stand", "ball_in_cup-catch", "finger-spin"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "humanoid-stand",
+        "ball_in_cup-catch",
+        "finger-spin",
+        pytest.param("manipulator-bring_ball", marks=pytest.mark.slow),
+    ],
+)
 def test_starts_touch_nothing(name):
     """In nearly all starts; and the draw sees what MuJoCo sees."""
     env = ours(name)
