@@ -12,13 +12,8 @@ from purerl.sweep.points import Base, Point, job, read_value
 from purerl.sweep.scheduler import how_it_ended, is_locked
 from purerl.sweep.spaces import Space
 
-ORDER = (
-    "done",
-    "training",
-    "stopped",
-    "waiting",
-    "failed",
-)  # a score of part of the seeds comes after whole
+# A score of a part of the seeds, or of a part of the training, comes after whole ones.
+ORDER = ("done", "training", "stopped", "waiting", "failed")
 
 
 class Row(NamedTuple):

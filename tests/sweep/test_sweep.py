@@ -206,10 +206,10 @@ def test_a_task_whose_time_is_over_saves_and_goes_on(place):
 @pytest.mark.slow
 def test_a_sweep_that_was_killed_ends_as_one_left_in_peace(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = [str(TOY), "--grid", "ppo.learning-rate=1e-2,1e-3", "--seeds", "2", "--jobs", "1"]
+    words = [str(TOY), "--grid", "ppo.learning-rate=1e-2,1e-3", "--seeds", "2"]
     words += ["--ppo.num-steps", "4800", "--checkpoints", "15"]
-    assert sweep.main([*words, "--name", "peace"]) == SUCCESS
-    command = [sys.executable, "-m", "purerl.sweep", *words, "--name", "killed"]
+    assert sweep.main([*words, "--name", "peace", "--jobs", "2"]) == SUCCESS
+    command = [sys.executable, "-m", "purerl.sweep", *words, "--name", "killed", "--jobs", "1"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     killed = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
     first = Path("sweeps/killed/toy_experiment/p0000-seed1")
@@ -220,7 +220,7 @@ def test_a_sweep_that_was_killed_ends_as_one_left_in_peace(tmp_path, monkeypatch
     killed.wait()
     os.kill(int((first / ".lock").read_text()), signal.SIGKILL)
     assert len((first / "metrics.jsonl").read_text().splitlines()) < 150
-    assert sweep.main([*words, "--name", "killed"]) == SUCCESS
+    assert sweep.main([*words, "--name", "killed", "--jobs", "2"]) == SUCCESS
     assert "--resume" in Path("sweeps/killed/logs/p0000.log").read_text()
     for point in ("p0000", "p0001"):
         lines = [read_lines(Path("sweeps") / name, point) for name in ("peace", "killed")]
