@@ -120,7 +120,7 @@ def execute(
                     calls_host=setup.engine == "c",
                 )  # fmt: skip
             if jax.default_backend() == "gpu" and processes.is_first():
-                exactness = manifest.exactness(setup.engine, facts["kernels"], made.unordered)
+                exactness = manifest.with_unordered(facts, made.unordered)
                 _tell_unordered(runs, exactness, made.unordered)
             return made
 
@@ -133,7 +133,8 @@ def _facts(
     """Returns what manifest.json says of a run that begins now."""
     builders = (chosen.build_env, chosen.build_network)
     kernels = exact.how_chosen(jax.default_backend())
-    facts = manifest.collect(setup.engine, builders, kernels, shards.number)
+    inexact = getattr(setup.env, "inexact", "")
+    facts = manifest.collect(setup.engine, builders, kernels, shards.number, inexact)
     facts["model"] = build_experiment.physics_hash(setup.env)
     facts["experiment_file"] = str(source.path)
     if options.vmapped_seeds > 1:
