@@ -44,6 +44,7 @@ class Guide(NamedTuple):
 
     act: Callable[[State, PyTree], tuple[Array, Array, PyTree]]
     memory: PyTree  # of one environment, at the start of an episode
+    discount: float  # gamma, of one control step: the value's
 
 
 class Plan(NamedTuple):
@@ -69,17 +70,17 @@ def guide(config: Config, network: Network, state: TrainState) -> Guide:
         return distributions.to_action(output.distribution.loc), output.value / factor, memory
 
     memory = jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), state.carry)
-    return Guide(act, memory)
+    return Guide(act, memory, config.gamma)
 
 
 def unguided(action_size: int) -> Guide:
-    """Returns the guide of whoever has learned nothing: actions 0, values 0."""
+    """Returns the guide of whoever has learned nothing: actions 0, values 0, no discount."""
 
     def act(env: State, memory: PyTree) -> tuple[Array, Array, PyTree]:
         number = env.reward.shape
         return jnp.zeros((*number, action_size)), jnp.zeros(number), memory
 
-    return Guide(act, ())
+    return Guide(act, (), 1.0)
 
 
 def start(settings: Settings, env: Env, guide: Guide) -> Plan:
@@ -105,11 +106,12 @@ def plan(
       The new plan, and the action [A] in [-1, 1].
     """
     count = settings.samples
-    sample = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), (state, last.memory))
+    begin = (state, last.memory)
+    states, memories = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), begin)
 
     def improve(center: tuple[Array, Array], key: Array) -> tuple[tuple[Array, Array], Array]:
         knots = draw(settings, *center, key)
-        returns = play(settings, env, guide, *sample, knots)
+        returns = play(settings, env, guide, states, memories, knots)
         share = sample_weights(settings, returns)
         value = jnp.sum(jnp.where(share > 0.0, share * returns, 0.0))
         return summarize(settings, knots, share), value
@@ -119,7 +121,7 @@ def plan(
     around = (mean, jnp.full(mean.shape, settings.noise))
     (knots, _), values = jax.lax.scan(improve, around, keys)
 
-    one = jax.tree.map(lambda x: x[None], (state, last.memory))
+    one = jax.tree.map(lambda x: x[None], begin)
     base, _, memory = guide.act(*one)
     action = jnp.clip(base[0] + spline(settings, knots[None])[0, 0], -1.0, 1.0)
     return Plan(knots, jax.tree.map(lambda x: x[0], memory), values[-1]), action
@@ -132,7 +134,7 @@ def spline(settings: Settings, knots: Array) -> Array:
 
 def shift(settings: Settings, knots: Array) -> Array:
     """Returns the knots [K, A] of the same plan one step later; its last action is repeated."""
-    return _matrix(settings, 1) @ knots
+    return jnp.asarray(_matrix(settings, 1)) @ knots
 
 
 def _matrix(settings: Settings, later: int) -> np.ndarray:
@@ -164,9 +166,9 @@ def play(
     lost, its state no longer finite, is worth -inf.
 
     Args:
-      settings: for H and gamma.
+      settings: for H.
       env: the environment.
-      guide: adds its actions, and values the end.
+      guide: adds its actions, and values the end; for gamma.
       state: where the plans begin, [N, ...].
       memory: the guide's, [N, ...].
       knots: of the plans, [N, K, A].
@@ -178,7 +180,7 @@ def play(
         total += jnp.where(due > 0.0, due * value, 0.0)
         state = jax.vmap(env.step)(state, jnp.clip(action + offset, -1.0, 1.0))
         total += jnp.where(weight > 0.0, weight * state.reward, 0.0)
-        weight *= settings.discount
+        weight *= guide.discount
         due = jnp.where(state.truncated & ~state.terminated, weight, 0.0)
         weight = jnp.where(state.terminated | state.truncated, 0.0, weight)
         return (state, memory, total, weight, due), None

@@ -28,8 +28,6 @@ class Settings:
     returns."""
     elites: int = 8
     """Of cem: how many of the best samples make the next plan."""
-    discount: float = 1.0
-    """Of one control step, in the return of a plan."""
 
     def __post_init__(self) -> None:
         """Raises ValueError for a number outside its range."""
@@ -40,7 +38,5 @@ class Settings:
         for name in ("noise", "temperature"):
             if not 0.0 < getattr(self, name) < float("inf"):
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be above 0.")
-        if not 0.0 < self.discount <= 1.0:
-            raise ValueError(f"discount is {self.discount}; it must be above 0 and at most 1.")
         if self.elites > self.samples:
             raise ValueError(f"elites is {self.elites}; there are only {self.samples} samples.")
