@@ -61,11 +61,12 @@ def command(words: Sequence[str]) -> None:
     set_xla_flags_in_time()
     set_up_jax(cache=True)
     problem, other, options = read(words, PROG)
-    groups = {}
-    pair = [problem] if other is None else [problem, other]
-    judges = dict(zip(BOTH, (one.setup.env for one in pair), strict=False)) if other else {}
-    for title, one in zip(BOTH, pair, strict=False):
-        groups[title] = play(title if other else "", one, options, judges)
+    if other is None:
+        groups = {str(options.planner): play("", problem, options, {})}
+    else:
+        pair = dict(zip(BOTH, (problem, other), strict=True))
+        judges = {title: one.setup.env for title, one in pair.items()}
+        groups = {title: play(title, one, options, judges) for title, one in pair.items()}
     about = {"problem": problem.name} | dataclasses.asdict(options)
     if options.csv is not None:
         write_file(options.csv, figures.rows(groups).encode())

@@ -38,9 +38,9 @@ class NoMemory(NamedTuple):
 def begin(
     config: Config, settings: Settings, env: Env, guide: Guide, key: Array, number: int
 ) -> Playing:
-    """Returns E episodes about to start; `key` [] as `evaluation.evaluate` takes it."""
+    """Returns E episodes about to start, by a key [] that nothing else uses."""
     nothing: Any = NoMemory()
-    progress = evaluation.start(config, env, nothing, jax.random.split(key)[0], number)
+    progress = evaluation.start(config, env, nothing, key, number)
     plans = jax.tree.map(
         lambda x: jnp.broadcast_to(x, (number, *x.shape)), planner.start(settings, env, guide)
     )
@@ -65,7 +65,7 @@ def advance(
         have given for the same action in the same state.
       keep: what to keep of each state, before the step; of one environment.
       guide: see `planner.plan`.
-      key: [] as `evaluation.evaluate` takes it.
+      key: [] typed, of all steps.
       playing: the episodes.
 
     Returns:
@@ -73,7 +73,7 @@ def advance(
       to the episode, "kept", "action", "reward", "metrics" and "judged".
     """
     now, number = playing.progress, len(playing.progress.over)
-    step_key = jax.random.fold_in(jax.random.split(key)[1], now.t)
+    step_key = jax.random.fold_in(key, now.t)
     keys = per_environment(step_key, jnp.arange(number))
     choose = functools.partial(planner.plan, settings, env, guide)
     plans, action = jax.vmap(choose)(playing.plan, now.env, keys)
@@ -125,8 +125,9 @@ def episodes(
         step = functools.partial(advance, settings, env, others, keep, make_guide(learned), key)
         return jax.lax.scan(lambda now, _: step(now), playing, length=CHUNK)
 
-    key = derive(jax.random.key(seed), Purpose.EVALUATION)
-    playing, go_on = jit("plan_start", first)(learned, key), jit("plan", chunk)
+    # As `evaluation.evaluate` does: the same beginnings.
+    reset_key, key = jax.random.split(derive(jax.random.key(seed), Purpose.EVALUATION))
+    playing, go_on = jit("plan_start", first)(learned, reset_key), jit("plan", chunk)
     while True:
         playing, rows = go_on(learned, key, playing)
         yield playing, jax.device_get(rows)

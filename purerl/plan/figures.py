@@ -29,11 +29,8 @@ def table(groups: Mapping[str, Figures]) -> list[str]:
         ]
     lines = [["", *columns], *([n, *row] for n, *row in zip(names, *columns.values(), strict=True))]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    printed = [
-        f"{row[0]:{widths[0]}}"
-        + "".join(f"  {x:>{w}}" for x, w in zip(row[1:], widths[1:], strict=True))
-        for row in lines
-    ]
+    cells = [[f"{x:>{w}}" for x, w in zip(line, widths, strict=True)] for line in lines]
+    printed = ["  ".join([row[0].strip().ljust(widths[0]), *row[1:]]) for row in cells]
     few = len(first[RETURN]) < LEAST_RUNS
     return printed + [f"Intervals need {LEAST_RUNS} episodes: --episodes {LEAST_RUNS}"] * few
 

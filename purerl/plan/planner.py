@@ -109,17 +109,16 @@ def plan(
     begin = (state, last.memory)
     states, memories = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), begin)
 
-    def improve(center: tuple[Array, Array], key: Array) -> tuple[tuple[Array, Array], Array]:
-        knots = draw(settings, *center, key)
+    def improve(center: tuple[Array, Array], turn: Array) -> tuple[tuple[Array, Array], Array]:
+        knots = draw(settings, *center, jax.random.fold_in(key, turn))
         returns = play(settings, env, guide, states, memories, knots)
         share = sample_weights(settings, returns)
         value = jnp.sum(jnp.where(share > 0.0, share * returns, 0.0))
         return summarize(settings, knots, share), value
 
     mean = shift(settings, last.knots)
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(settings.iterations))
     around = (mean, jnp.full(mean.shape, settings.noise))
-    (knots, _), values = jax.lax.scan(improve, around, keys)
+    (knots, _), values = jax.lax.scan(improve, around, jnp.arange(settings.iterations))
 
     one = jax.tree.map(lambda x: x[None], begin)
     base, _, memory = guide.act(*one)

@@ -14,7 +14,7 @@ def knot_times(kind: str, horizon: int, knots: int) -> np.ndarray:
     The last knot of a zero-order spline lasts as long as the others; of the other kinds, it is the
     plan's last action.
     """
-    end = horizon if kind == "zero" else horizon - 1
+    end = horizon if kind == "zero" else max(horizon - 1, 1)
     return np.linspace(0.0, end, knots, endpoint=kind != "zero")
 
 
