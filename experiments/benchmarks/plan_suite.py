@@ -10,6 +10,7 @@ table of means with 95% intervals is printed at the end, and by --table alone.
 import argparse
 import csv
 import dataclasses
+import itertools
 import time
 from pathlib import Path
 
@@ -45,11 +46,12 @@ def play(task: str, settings: Settings, steps: int, seed: int, number: int) -> l
     config = dataclasses.replace(config, episode_length=limit)
     guide = planner.unguided(env.action_size)
     game = episodes.episodes(config, settings, env, lambda _: guide, (), seed, number)
-    calls, (end, _) = 0, next(game)
-    begin = time.perf_counter()  # what came before was compiling, and the first call
-    for end, _ in game:
-        calls += 1
-    rate = calls * episodes.CHUNK * number / (time.perf_counter() - begin) if calls else np.nan
+    times = []
+    for playing, _ in game:
+        end = playing
+        times.append(time.perf_counter())
+    # The first call was compiling.
+    rate = (len(times) - 1) * episodes.CHUNK * number / max(times[-1] - times[0], 1e-9)
     found = episodes.results(end)
     about = {"task": task, "planner": settings.planner, "steps": limit, "seed": seed}
     return [
@@ -100,13 +102,8 @@ def main() -> int:
     options = parser.parse_args()
     set_up_jax(cache=True)
     file = Path(options.out)
-    tasks = [
-        (seed, t, p)
-        for seed in range(options.batches)
-        for t in options.only
-        for p in options.planners
-    ]
-    for seed, task, name in tasks if not options.table else ():
+    games = itertools.product(range(options.batches), options.only, options.planners)
+    for seed, task, name in () if options.table else games:
         limit = options.steps or experiment_of(task).ppo.episode_length
         done = [(r["task"], r["planner"], int(r["steps"]), int(r["seed"])) for r in read(file)]
         if (task, name, limit, seed) in done:
