@@ -23,7 +23,7 @@ class Options(Settings):
     """What is planned, and what becomes of it."""
 
     episodes: int = 1
-    """Episodes, planned side by side; intervals need 5."""
+    """Episodes, planned side by side; intervals need 5, those of --against too."""
     steps: int = 0
     """Control steps of an episode at most; 0: the experiment's time limit."""
     seed: int = 0
