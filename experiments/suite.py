@@ -1,4 +1,4 @@
-"""dm_control's control suite, 19 of its tasks with the same settings.
+"""dm_control's control suite, all 28 tasks of its benchmark with the same settings.
 
 python -m purerl.run suite --env.task cheetah-run --name cheetah-run
 

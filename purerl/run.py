@@ -76,7 +76,8 @@ def _command(arguments: Sequence[str]) -> None:
 
         if is_first():
             shown = render.Options(folders[0], trust=True)
-            if _attempt("video", _show_policy, shown, files := []):
+            files: list[str] = []
+            if _attempt("video", _show_policy, shown, files):
                 _attempt("video for the loggers", _log_video, options, folders[0], files[-1])
 
 

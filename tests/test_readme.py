@@ -75,7 +75,8 @@ def all_help():
 def unknown_options(words):
     """Returns the options of one of our commands that its help page does not have."""
     module, *rest = words
-    page = help_page(module, *rest[: module == "purerl.run"])
+    named = rest[: module in ("purerl.run", "purerl.plan")]
+    page = help_page(module, *(re.sub(r"^runs/(\w+)/.*", r"\1", name) for name in named))
     return [word for word in options(rest) if not re.search(rf"{re.escape(word)}\b", page)]
 
 

@@ -23,8 +23,9 @@ MAY_IMPORT = {
     "report": {"core", "ppo", "physics", "devices", "runs"},
     "adapters": {"core", "ppo", "physics"},
     "sweep": {"core", "runs", "report"},
+    "plan": {"core", "ppo", "devices", "runs", "report"},
 }
-# Files beside the rooms. The commands `report` and `sweep` are the rooms of those names.
+# Files beside the rooms. The commands `report`, `sweep`, `plan` are the rooms of those names.
 COMMANDS = {"compare", "evaluate", "export", "plot", "record", "render", "run"}
 MODULES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path

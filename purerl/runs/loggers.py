@@ -115,6 +115,7 @@ class WandbSink:
     """Sends records to Weights & Biases; a resumed run goes on under the same id."""
 
     def __init__(self, folder: Path, mode: Any, project: str) -> None:
+        """Begins a W&B run, or goes on with it: `mode` is online or offline."""
         import wandb
 
         self.run = wandb.init(

@@ -24,6 +24,8 @@ from purerl.runs.run_folder import is_begun
 
 POLL = 0.2  # [s]
 TAIL = 1 << 16  # [bytes] of a log in which its last line is looked for
+LONGEST = 400  # letters of why a job failed
+RUN = ("-m", "purerl.run")
 CORES = 2  # of a run on a CPU, where NPROC says nothing else
 END = "[exit code "  # how the last line of a log begins; one without it was cut by a kill
 PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -88,8 +90,9 @@ def how_it_ended(job: Job) -> Ended:
     code = lines[-1].removeprefix(END).rstrip("]") if lines and lines[-1].startswith(END) else ""
     if code in ("", str(INTERRUPTED), str(SUCCESS)):
         return Ended(job, "stopped")
-    ours = [line for line in lines if line.startswith("purerl: ")]
-    said = (ours or lines[:-1] or ["it said nothing"])[-1].removeprefix("purerl: ")
+    ours = [i for i, line in enumerate(lines) if line.startswith("purerl: ")]
+    told = lines[ours[-1] : -1] if ours else lines[-2:-1]  # ours may have lines below it
+    said = " ".join(told).removeprefix("purerl: ")[:LONGEST] or "it said nothing"
     if code.startswith("-"):
         said = f"killed by {signal.Signals(-int(code)).name}"
     return Ended(job, "failed", said)
@@ -165,7 +168,7 @@ def start(job: Job, more: Mapping[str, str], before: tuple[str, ...] = ()) -> su
       more: of its environment, besides ours.
       before: words before the command, of a shell that prepares it.
     """
-    words = ["-m", "purerl.run", *job.words]
+    words = [*RUN, *job.words]
     with contextlib.suppress(UserError):  # a broken manifest: the run will say so
         words += ["--resume"] if any(map(is_begun, job.folders)) else []
     make_folder(job.log.parent)

@@ -40,8 +40,8 @@ def execute(arguments: Sequence[str]) -> int:
         sweep.points.extend(Point(number, values) for number, values in enumerate(drawn))
         points.check_all(base, sweep.points)
     if options.slurm:
-        slurm.parameters(options.slurm)
         study.check_installed("submitit")
+        slurm.check(options.slurm)
     if options.dry_run:
         return _show_commands(sweep)
     with _begin(sweep):
@@ -168,7 +168,7 @@ def _carry_out(sweep: Sweep) -> int:
         f"{at_once} at once on {place}")  # fmt: skip
     asked = scheduler.carry_out(progress.jobs(), at_once, gpus, progress.began, progress.ended)
     status = {row.status for row in _report(sweep, list(progress.points.values()))}
-    if asked or status & {"stopped", "training"}:
+    if asked or status & {"stopped", "training", "waiting"}:
         warn("Stopped; the same command goes on.")
         return INTERRUPTED
     return FAILURE if "failed" in status else SUCCESS

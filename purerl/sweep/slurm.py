@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 import signal
 import subprocess
 import time
@@ -64,6 +65,15 @@ def parameters(text: str) -> dict[str, int | str]:
     return found
 
 
+def check(text: str) -> None:
+    """Raises UserError unless the parameters can be read, and there is a SLURM to take jobs."""
+    if parameters(text).get("cluster", "slurm") == "slurm" and shutil.which("sbatch") is None:
+        raise UserError(
+            "There is no SLURM on this machine (no sbatch): give the command on a login node, or "
+            "try it here with --slurm cluster=local."
+        )
+
+
 def submit(jobs: Sequence[Job], folder: Path, text: str, at_once: int) -> tuple[list[str], int]:
     """Submits the jobs that are neither done nor in the queue.
 
@@ -79,7 +89,7 @@ def submit(jobs: Sequence[Job], folder: Path, text: str, at_once: int) -> tuple[
     import submitit
 
     given = parameters(text)
-    cluster = given.pop("cluster", None)
+    cluster = given.pop("cluster", "slurm")
     place = folder / FOLDER
     try:
         executor = submitit.AutoExecutor(folder=place, cluster=cluster)

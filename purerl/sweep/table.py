@@ -12,7 +12,8 @@ from purerl.sweep.points import Base, Point, job, read_value
 from purerl.sweep.scheduler import how_it_ended, is_locked
 from purerl.sweep.spaces import Space
 
-ORDER = ("done", "training", "stopped", "failed")  # a score of part of the seeds comes after whole
+# A score of a part of the seeds, or of a part of the training, comes after whole ones.
+ORDER = ("done", "training", "stopped", "waiting", "failed")
 
 
 class Row(NamedTuple):
@@ -33,7 +34,11 @@ def make_rows(base: Base, points: Sequence[Point], metric: str) -> list[Row]:
     for point in points:
         one = job(base, point)
         found = how_it_ended(one)
-        status = "training" if found.status != "done" and is_locked(one) else found.status
+        status = found.status
+        if status != "done" and is_locked(one):
+            status = "training"
+        elif status == "stopped" and not one.log.exists():
+            status = "waiting"
         typed = {name: read[name, text] for name, text in point.values.items()}
         summary = summarize(group_of(base, point), metric)
         rows.append(Row(point, typed, status, found.said, summary))
