@@ -110,7 +110,7 @@ def describe(rows: Sequence[Row], spaces: Sequence[Space], metric: str) -> list[
         record |= {space.setting: _shown(record[space.setting]) for space in spaces}
     counts = {status: sum(row.status == status for row in rows) for status in ORDER}
     told = ", ".join(f"{number} {status}" for status, number in counts.items() if number)
-    lines = [f"{len(rows)} points ({told}), {metric} at the end"]
+    lines = [f"{len(rows)} point{'s' * (len(rows) > 1)} ({told}), {metric} at the end"]
     lines += comparison.table(columns, records)
     lines += [f"{row.point.name} failed: {row.said}" for row in rows if row.status == "failed"]
     return lines + comparison.notes([row.summary for row in rows])
