@@ -16,7 +16,8 @@ def row(number: int, score, status: str = "done", **values) -> Row:
     texts = {name: str(value) for name, value in values.items()}
     runs = {} if score is None else {"seed1": score}
     summary = {"iqm": score, "n": len(runs), "runs": runs, "interval": None, "mean": score}
-    return Row(Point(number, texts), values, status, "", summary | {"worst": score})
+    summary |= {"worst": score, "done": len(runs), "failed": 0, "unfinished": 0}
+    return Row(Point(number, texts), values, status, "", summary)
 
 
 def test_numbers_stand_in_the_order_of_numbers():
@@ -54,6 +55,14 @@ def test_any_kind_of_value_is_drawn(tmp_path):
     assert picture.draw(tmp_path / "a.png", rows, spaces, "eval/x")
     assert (tmp_path / "a.png").stat().st_size > 5000
     assert not picture.draw(tmp_path / "b.png", rows[2:], spaces, "eval/x")
+
+
+def test_digits_are_few_and_what_has_no_run_brings_no_note():
+    rows = [row(0, 1.0, x=0.000123456789), row(1, None, "failed", x=3)]
+    rows[0].summary["interval"] = {"low": 0.5, "high": 1.5}
+    lines = table.describe(rows, [parse_space("x", "1", False)], "eval/x")
+    assert "0.0001235" in lines[2] and "[0.5, 1.5]" in lines[2]
+    assert lines[4:] == ["p0001 failed: "]
 
 
 def test_a_point_that_has_not_begun_waits(tmp_path):
