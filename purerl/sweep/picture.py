@@ -92,6 +92,9 @@ def _draw_panel(panel: Any, rows: Sequence[Row], space: Space) -> None:
     panel.grid(alpha=0.3)
     if numbers and has_log_axis(space, values):
         panel.set_xscale("log")
+        # Matplotlib's own labels of decades need its mathematics.
+        panel.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
+        panel.xaxis.set_minor_formatter(lambda x, _: "")
     if not numbers or (space.choices and len(names) <= 8):  # the values themselves, no others
         panel.set_xticks(different, [_label(name) for name in names])
         panel.minorticks_off()

@@ -110,16 +110,24 @@ def describe(rows: Sequence[Row], spaces: Sequence[Space], metric: str) -> list[
         record |= {space.setting: _shown(record[space.setting]) for space in spaces}
     counts = {status: sum(row.status == status for row in rows) for status in ORDER}
     told = ", ".join(f"{number} {status}" for status, number in counts.items() if number)
-    lines = [f"{len(rows)} points ({told}), {metric} at the end"]
+    lines = [f"{len(rows)} point{'s' * (len(rows) > 1)} ({told}), {metric} at the end"]
     lines += comparison.table(columns, records)
     lines += [f"{row.point.name} failed: {row.said}" for row in rows if row.status == "failed"]
-    return lines + comparison.notes([row.summary for row in rows])
+    return lines + comparison.notes([row.summary for row in rows if _has_runs(row)])
+
+
+def _has_runs(row: Row) -> bool:
+    return any(row.summary[name] for name in ("done", "failed", "unfinished"))
 
 
 def _shown(text: str) -> str:
-    """Returns a value as it was given, a long number shortened."""
+    """Returns a value as it was given, many digits as four.
+
+    >>> _shown("3e-4"), _shown("0.000123456789"), _shown("100000000"), _shown("64 64")
+    ('3e-4', '0.0001235', '100000000', '64 64')
+    """
     try:
-        return text if len(text) <= 10 else f"{float(text):.4g}"
+        return f"{float(text):.4g}" if "." in text and len(text) > 7 else text
     except ValueError:
         return text
 

@@ -47,7 +47,8 @@ def write(seed: int, update: int) -> None:
 
 signal.signal(signal.SIGTERM, stop)
 signal.signal(signal.SIGINT, stop)
-print("resumed" if words["resume"] else "begun", os.environ.get("CUDA_VISIBLE_DEVICES"), flush=True)
+print("resumed" if words["resume"] else "begun", os.environ.get("CUDA_VISIBLE_DEVICES"))
+print("alone" if os.getpgrp() == os.getpid() else "in the group of its scheduler", flush=True)
 if gamma == 0.5:
     sys.exit("purerl: gamma is 0.5.\n  Take another one.")
 if gamma == 0.6:

@@ -120,6 +120,26 @@ def test_gpus_are_taken_in_turn_by_those_that_run(place):
     assert sorted(said[:2]) == ["begun 4", "begun 7"] and set(said) == {"begun 4", "begun 7"}
 
 
+@pytest.mark.slow
+def test_a_terminal_s_ctrl_c_reaches_a_run_once(place):
+    """A second signal would end it at once: the terminal's own must not reach it."""
+    one = job("a")
+    carry_out([one])
+    assert "alone" in one.log.read_text().splitlines()
+
+
+@pytest.mark.slow
+def test_done_is_what_has_its_last_checkpoint(place):
+    one = job("a")
+    assert not scheduler.is_done(one)
+    carry_out([one])
+    assert scheduler.is_done(one)
+    (one.folders[1] / "checkpoints" / f"{4:012d}").rmdir()
+    assert not scheduler.is_done(one)
+    carry_out([one])
+    assert scheduler.is_done(one) and begun(one) == 2
+
+
 def test_how_many_at_once(monkeypatch, tmp_path):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(16)))
     assert jobs_at_once([], {}) == 8
