@@ -46,27 +46,31 @@ def test_its_files_bear_its_name(inside):
     assert subprocess.run(lint, cwd="crane").returncode == 0
 
 
+def said(project, module, *words):
+    """Returns what a command prints in the project's folder; it has to succeed."""
+    command = [sys.executable, "-m", module, *words]
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=project, env=env)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
 @pytest.mark.slow
-def test_it_trains_and_its_tests_pass(inside):
+def test_its_own_tests_pass(inside):
+    write_project(Path("crane"))
+    assert "5 passed" in said("crane", "pytest", "-q", "-p", "no:cacheprovider")
+
+
+@pytest.mark.slow
+def test_it_is_checked_without_a_finding(inside):
+    write_project(Path("crane"))
+    found = said("crane", "purerl.check", "experiment.py", "--no-speed")
+    assert found.endswith("experiment: 0 errors, 0 warnings\n")
+
+
+@pytest.mark.slow
+def test_it_trains(inside):
     write_project(Path("crane"))
     few = ["--ppo.num-steps", "8192", "--evaluation.num-episodes", "4", "--evaluation.number", "1"]
-    words = {
-        "pytest": ["-q", "-p", "no:cacheprovider"],
-        "purerl.check": ["experiment.py", "--no-speed"],
-        "purerl.run": ["experiment.py", *few],
-    }
-    said = {}
-    for module, rest in words.items():
-        done = subprocess.run(
-            [sys.executable, "-m", module, *rest],
-            capture_output=True,
-            text=True,
-            cwd=inside / "crane",
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-        said[module] = done.stdout
-    assert "5 passed" in said["pytest"]
-    assert said["purerl.check"].endswith("experiment: 0 errors, 0 warnings\n")
-    assert "Done: 8,192 steps" in said["purerl.run"]
-    assert "warning" not in said["purerl.run"]
+    lines = said("crane", "purerl.run", "experiment.py", *few)
+    assert "Done: 8,192 steps" in lines and "warning" not in lines
