@@ -21,6 +21,7 @@ from purerl.runs.findings import Finding, error, ok, warning
 from purerl.runs.user_code import told
 
 FEW_SAMPLES = 32  # in a minibatch, whose gradient is then mostly noise
+OBSERVATIONS = 256  # that a network is tried on, at most
 SHARE = 0.5  # of the memory: what the estimate leaves out may be as much again
 
 
@@ -48,10 +49,10 @@ def examine(chosen: Experiment, speed: bool) -> Iterator[Finding]:
     if any(one.level == "error" for one in [*found, *env_found]):
         return  # what follows would fail by the same, or fill the memory
     with told("The network: "):
-        start = _starts(setup)
-        yield from examine_network.examine(setup.network, start.observation)
+        few = _starts(setup, min(setup.config.num_envs, OBSERVATIONS))
+        yield from examine_network.examine(setup.network, few.observation)
     if speed:
-        yield from _speeds(setup, start)
+        yield from _speeds(setup, _starts(setup, setup.config.num_envs))
 
 
 def check_memory(setup: Setup, abstract: PyTree) -> Finding:
@@ -83,9 +84,9 @@ def check_minibatch(setup: Setup, abstract: PyTree) -> Finding:
     return ok("minibatches", what + whole)
 
 
-def _starts(setup: Setup) -> State:
-    """Returns fresh environments, as many as in a run."""
-    keys = jax.random.split(jax.random.key(0), setup.config.num_envs)
+def _starts(setup: Setup, number: int) -> State:
+    """Returns fresh environments."""
+    keys = jax.random.split(jax.random.key(0), number)
     return jax.jit(jax.vmap(setup.env.reset))(keys)
 
 

@@ -171,7 +171,7 @@ def check_scale(trial: Trial) -> Iterator[Finding]:
         values = values.reshape(-1, *start.shape[1:])
         mean, std = values.mean(0), values.std(0)
         kinds = {
-            "never varies": std == 0,
+            "does not vary": std == 0,
             f"varies by less than 1/{STEADY:g} of its mean": (std > 0)
             & (np.abs(mean) > STEADY * std),
             f"has a std beyond {LARGE:g}": std > LARGE,
@@ -186,8 +186,8 @@ def check_scale(trial: Trial) -> Iterator[Finding]:
 
 
 def _cure(what: str) -> str:
-    if what.startswith("never"):
-        return "by random actions; if it never does, leave it out"
+    if what.startswith("does not"):
+        return "leave it out, unless other actions than random ones change it"
     if what.startswith("varies"):
         return "take the mean off, or digits are lost"
     return "choose another unit"

@@ -99,7 +99,7 @@ class WrongReward(Toy):
         (OverAtOnce(), "ends", "error: 16 of 16 episodes have ended when reset returns"),
         (OneStep(), "ends", "error: every episode ends at its first step"),
         (NoReward(), "reward", "warning: it is 0 at every one of"),
-        (Seeing(scale=0.0), "scale", "warning: observation/policy [2] never varies"),
+        (Seeing(scale=0.0), "scale", "warning: observation/policy [2] does not vary"),
         (Seeing(offset=1e5), "scale", "warning: observation/policy [2] varies by less than 1/"),
         (Seeing(scale=1e5), "scale", "warning: observation/policy [2] has a std beyond 10000"),
         (HalfDeaf(), "actions", "warning: entries 1 of 2 change nothing in"),
