@@ -11,7 +11,8 @@ from purerl.runs.experiment import summary
 from purerl.runs.output import show
 
 COMMANDS = (
-    "run", "evaluate", "render", "record", "export", "compare", "report", "plot", "sweep", "plan",
+    "new", "check", "run", "evaluate", "render", "record", "export", "compare", "report", "plot",
+    "sweep", "plan",
 )  # fmt: skip
 
 HERE = Path(__file__).parent

@@ -26,7 +26,7 @@ MAY_IMPORT = {
     "plan": {"core", "ppo", "devices", "runs", "report"},
 }
 # Files beside the rooms. The commands `report`, `sweep`, `plan` are the rooms of those names.
-COMMANDS = {"compare", "evaluate", "export", "plot", "record", "render", "run"}
+COMMANDS = {"check", "compare", "evaluate", "export", "new", "plot", "record", "render", "run"}
 MODULES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
     for path in HOUSE.rglob("*.py")
