@@ -24,7 +24,7 @@ MAY_IMPORT = {
     "adapters": {"core", "ppo", "physics"},
 }
 # Files beside the rooms. The command `report` is the room of that name, by its __main__.py.
-COMMANDS = {"compare", "evaluate", "export", "plot", "record", "render", "run"}
+COMMANDS = {"check", "compare", "evaluate", "export", "new", "plot", "record", "render", "run"}
 MODULES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
     for path in HOUSE.rglob("*.py")
