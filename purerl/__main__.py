@@ -10,7 +10,9 @@ from purerl.runs.command_errors import leave, tell
 from purerl.runs.experiment import summary
 from purerl.runs.output import show
 
-COMMANDS = ("run", "evaluate", "render", "record", "export", "compare", "report", "plot", "sweep")
+COMMANDS = (
+    "run", "evaluate", "render", "record", "export", "compare", "report", "plot", "sweep", "plan",
+)  # fmt: skip
 
 HERE = Path(__file__).parent
 

@@ -7,7 +7,7 @@ May import: core, ppo, physics. Read: `stepping.py`, then the file of the librar
   from_brax(BraxOptions(name)), from_playground(PlaygroundOptions(name)): their environments for us.
   from_gymnasium(GymnasiumOptions(name)), from_maker(make): Gymnasium's, stepped through the host.
 
-A name is imported when it is first used: each needs its library. docs/adapters.md shows all.
+A name is imported when it is first used: each needs its library. docs/howto/adapters.md shows all.
 """
 
 import importlib

@@ -12,6 +12,7 @@ from dm_control.utils import rewards
 
 from envs.suite import base, hopper, tasks
 from envs.suite.rewards import SIGMOIDS, tolerance
+from purerl import run
 from purerl.runs.check_env import check_env
 from tests import quick
 
@@ -154,6 +155,7 @@ def test_steps_are_dm_controls(pair):
         "reacher-easy",
         "acrobot-swingup",
         "ball_in_cup-catch",
+        "fish-swim",
     ],
 )
 def test_engines_agree(name):
@@ -249,7 +251,22 @@ def test_an_unknown_task_is_named():
         hopper.build(hopper.Options("walk"))
 
 
-@pytest.mark.parametrize("name", ["humanoid-stand", "ball_in_cup-catch", "finger-spin"])
+def test_the_command_names_the_nearest_task(capsys):
+    assert run.main(["suite", "--env.task", "fish-swm"]) == 2
+    said = capsys.readouterr().err
+    assert "did you mean 'fish-swim'? It must be one of 'acrobot-swingup'," in said
+    assert len(said.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "humanoid-stand",
+        "ball_in_cup-catch",
+        "finger-spin",
+        pytest.param("manipulator-bring_ball", marks=pytest.mark.slow),
+    ],
+)
 def test_starts_touch_nothing(name):
     """In nearly all starts; and the draw sees what MuJoCo sees."""
     env = ours(name)
