@@ -196,16 +196,27 @@ def play(
 
 
 def sample_weights(settings: Settings, returns: Array) -> Array:
-    """Returns the share of each sample in the next plan, [N] of sum 1; see the module.
+    """Returns the share of each sample in the next plan, [N] of sum 1.
 
-    MPPI's temperature lambda is a multiple of the standard deviation of the returns, so that it
-    means the same for rewards of any scale. Lost samples (-inf) have no share; if all are, the
-    last plan stays.
+    Lost samples (-inf) have no share; if all are, the last plan stays. If all samples are worth
+    exactly the same, a random one is taken: where the reward says nothing, the body moves about and
+    comes to where it says something, instead of lying still.
     """
     sound = jnp.isfinite(returns)
-    best = jax.nn.one_hot(jnp.argmax(returns), len(returns))
+    first, last = jax.nn.one_hot(jnp.array([0, len(returns) - 1]), len(returns))
+    nothing_known = jnp.all(returns == returns[0]) & sound.all()
+    share = jnp.where(nothing_known, last, _shares(settings, returns, sound))
+    return jnp.where(sound.any(), share, first)
+
+
+def _shares(settings: Settings, returns: Array, sound: Array) -> Array:
+    """Returns the shares by the equations of the module.
+
+    MPPI's temperature lambda is a multiple of the standard deviation of the returns, so that it
+    means the same for rewards of any scale.
+    """
     if settings.planner == "predictive_sampling":
-        return best
+        return jax.nn.one_hot(jnp.argmax(returns), len(returns))
     if settings.planner == "mppi":
         count = jnp.maximum(sound.sum(), 1)
         mean = jnp.sum(jnp.where(sound, returns, 0.0)) / count
@@ -215,7 +226,7 @@ def sample_weights(settings: Settings, returns: Array) -> Array:
     else:
         _, places = jax.lax.top_k(returns, settings.elites)
         share = jax.nn.one_hot(places, len(returns)).sum(axis=0) * sound
-    return jnp.where(sound.any(), share / jnp.maximum(share.sum(), EQUAL), best)
+    return share / jnp.maximum(share.sum(), EQUAL)
 
 
 def summarize(settings: Settings, knots: Array, share: Array) -> tuple[Array, Array]:

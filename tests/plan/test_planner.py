@@ -54,8 +54,10 @@ def test_a_lost_sample_has_no_share(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_equal_returns_are_no_division_by_zero(name):
-    assert shares(name, [2.0] * 4).sum() == pytest.approx(1.0)
+def test_where_the_reward_says_nothing_a_random_sample_is_taken(name):
+    """The first two are no random ones: the plan as it was, and the guide's own behaviour."""
+    assert shares(name, [2.0] * 4).tolist() == [0.0, 0.0, 0.0, 1.0]
+    assert shares(name, [2.0, 2.0, -jnp.inf, 2.0])[3] < 1.0
 
 
 @pytest.mark.parametrize(
@@ -159,7 +161,7 @@ def test_with_a_perfect_value_one_step_is_enough():
     _, action = choose(settings, blind, planner.Guide(act, (), 1.0), 0.0, steps=3)
     assert float(action[0]) > 0.95
     _, action = choose(settings, blind, UNGUIDED, 0.0, steps=3)
-    assert float(action[0]) == 0.0  # nothing is better than the plan there is
+    assert float(action[0]) < 0.95  # nothing is known of where to go
 
 
 @pytest.mark.slow
