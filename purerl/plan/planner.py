@@ -29,6 +29,9 @@ from purerl.plan.settings import Settings
 from purerl.ppo import batches, distributions, rollout
 from purerl.ppo.config import Config
 
+# The noise of the first sample and of the last, of the settings' noise. In its first 200 steps a
+# cheetah earned 83 with it, and 66 with the same noise for all.
+SPREAD = (0.25, 4.0)
 # CEM: what is left of the noise where the elites agree, so that a plan can still change.
 LEAST_NOISE = 0.05
 # MPPI: returns as close as this are equal.
@@ -146,10 +149,13 @@ def _matrix(settings: Settings, later: int) -> np.ndarray:
 def draw(settings: Settings, mean: Array, scale: Array, key: Array) -> Array:
     """Draws samples [N, K, A] around a plan [K, A] with standard deviations [K, A].
 
-    The first one is the plan itself, the second is 0: what the guide does by itself.
+    The first one is the plan itself, the second is 0: what the guide does by itself. From sample to
+    sample the noise grows, from the first of `SPREAD` times `scale` to the last: fine corrections
+    and new beginnings in one batch.
     """
+    spread = jnp.geomspace(*SPREAD, settings.samples)[:, None, None]
     noise = jax.random.normal(key, (settings.samples, *mean.shape)).at[0].set(0.0)
-    samples = jnp.clip(mean + scale * noise, -1.0, 1.0)
+    samples = jnp.clip(mean + spread * scale * noise, -1.0, 1.0)
     return samples.at[1].set(0.0)
 
 

@@ -73,6 +73,17 @@ def test_settings_out_of_range(settings, message):
         Settings(**settings)
 
 
+def test_samples_are_the_plan_the_guide_alone_and_more_and_more_noise():
+    settings = Settings(samples=400, noise=0.02)
+    mean = jnp.full((50, 4), 0.1)
+    knots = planner.draw(settings, mean, jnp.full(mean.shape, 0.02), jax.random.key(0))
+    assert bool((knots[0] == mean).all()) and not knots[1].any()
+    deviation = np.asarray(knots - mean).std(axis=(1, 2))
+    assert deviation[2:12].mean() == pytest.approx(0.02 / 4, rel=0.15)
+    assert deviation[-10:].mean() == pytest.approx(0.02 * 4, rel=0.15)
+    assert float(jnp.abs(planner.draw(settings, mean, mean * 99, jax.random.key(0))).max()) == 1.0
+
+
 # --- what plans are worth ---
 
 
