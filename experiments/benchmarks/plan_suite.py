@@ -55,9 +55,10 @@ def limit_of(task: str) -> int:
 
 
 def settings_of(task: str, name: str) -> Settings:
-    """Returns a planner's settings by its name for a task, with "+policy" or without; "policy": no search.
+    """Returns a planner's settings for a task by its name, with "+policy" or without.
 
-    The first two samples are the plan, at first 0, and 0: with no more than these nothing changes.
+    "policy" is no search: the first two samples are the plan, at first 0, and 0, and there are no
+    more.
     """
     if name == "policy":
         return Settings(samples=2, elites=2, horizon=1, knots=2)
