@@ -10,7 +10,10 @@ from purerl.runs.command_errors import leave, tell
 from purerl.runs.experiment import summary
 from purerl.runs.output import show
 
-COMMANDS = ("run", "evaluate", "render", "record", "export", "compare", "report", "plot", "plan")
+COMMANDS = (
+    "new", "check", "run", "evaluate", "render", "record", "export", "compare", "report", "plot",
+    "sweep", "plan",
+)  # fmt: skip
 
 HERE = Path(__file__).parent
 

@@ -22,10 +22,11 @@ MAY_IMPORT = {
     "runs": {"core", "exact", "ppo", "physics", "devices"},
     "report": {"core", "ppo", "physics", "devices", "runs"},
     "adapters": {"core", "ppo", "physics"},
+    "sweep": {"core", "runs", "report"},
     "plan": {"core", "ppo", "devices", "runs", "report"},
 }
-# Files beside the rooms. `report` and `plan` are rooms of that name, by their __main__.py.
-COMMANDS = {"compare", "evaluate", "export", "plot", "record", "render", "run"}
+# Files beside the rooms. The commands `report`, `sweep`, `plan` are the rooms of those names.
+COMMANDS = {"check", "compare", "evaluate", "export", "new", "plot", "record", "render", "run"}
 MODULES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
     for path in HOUSE.rglob("*.py")
