@@ -34,6 +34,8 @@ from purerl.runs.experiment import Experiment, available, find
 from purerl.runs.loaded_run import load
 
 MUST_SHOW = ("cartpole-swingup", "walker-walk", "cheetah-run", "hopper-hop", "humanoid-stand")
+# A lying hopper earns 0 whatever it does, until a wild movement has thrown it up.
+OTHER_SETTINGS = {"hopper-hop": {"spline": "zero", "noise": 1.0}}
 PLANNERS = ("predictive_sampling", "mppi", "cem")
 FIGURES = ("return", "length", "lost", "plans_per_s")
 COLUMNS = ("task", "planner", "steps", "seed", "episode", *FIGURES)
@@ -52,14 +54,16 @@ def limit_of(task: str) -> int:
     return known.ppo.episode_length
 
 
-def settings_of(name: str) -> Settings:
-    """Returns a planner's settings by its name, with "+policy" or without; "policy": no search.
+def settings_of(task: str, name: str) -> Settings:
+    """Returns a planner's settings for a task by its name, with "+policy" or without.
 
-    The first two samples are the plan, at first 0, and 0: with no more than these nothing changes.
+    "policy" is no search: the first two samples are the plan, at first 0, and 0, and there are no
+    more.
     """
     if name == "policy":
         return Settings(samples=2, elites=2, horizon=1, knots=2)
-    return Settings(planner=name.removesuffix("+policy"))
+    kind: Any = name.removesuffix("+policy")
+    return dataclasses.replace(Settings(kind), **OTHER_SETTINGS.get(task, {}))
 
 
 def play(task: str, name: str, steps: int, seed: int, number: int) -> list[dict]:
@@ -75,7 +79,7 @@ def play(task: str, name: str, steps: int, seed: int, number: int) -> list[dict]
         return planner.guide(config, network, learned)
 
     learned = run.state if run and name.endswith("policy") else None
-    game = episodes.episodes(config, settings_of(name), env, guide, learned, seed, number)
+    game = episodes.episodes(config, settings_of(task, name), env, guide, learned, seed, number)
     times = []
     for playing, _ in game:
         end = playing

@@ -29,6 +29,9 @@ from purerl.plan.settings import Settings
 from purerl.ppo import batches, distributions, rollout
 from purerl.ppo.config import Config
 
+# The noise of the first sample and of the last, of the settings' noise. In its first 200 steps a
+# cheetah earned 83 with it, and 66 with the same noise for all (one episode each).
+SPREAD = (0.25, 4.0)
 # CEM: what is left of the noise where the elites agree, so that a plan can still change.
 LEAST_NOISE = 0.05
 # MPPI: returns as close as this are equal.
@@ -146,10 +149,13 @@ def _matrix(settings: Settings, later: int) -> np.ndarray:
 def draw(settings: Settings, mean: Array, scale: Array, key: Array) -> Array:
     """Draws samples [N, K, A] around a plan [K, A] with standard deviations [K, A].
 
-    The first one is the plan itself, the second is 0: what the guide does by itself.
+    The first one is the plan itself, the second is 0: what the guide does by itself. From sample to
+    sample the noise grows, from the first of `SPREAD` times `scale` to the last: fine corrections
+    and new beginnings in one batch.
     """
+    spread = jnp.geomspace(*SPREAD, settings.samples)[:, None, None]
     noise = jax.random.normal(key, (settings.samples, *mean.shape)).at[0].set(0.0)
-    samples = jnp.clip(mean + scale * noise, -1.0, 1.0)
+    samples = jnp.clip(mean + spread * scale * noise, -1.0, 1.0)
     return samples.at[1].set(0.0)
 
 
@@ -196,16 +202,27 @@ def play(
 
 
 def sample_weights(settings: Settings, returns: Array) -> Array:
-    """Returns the share of each sample in the next plan, [N] of sum 1; see the module.
+    """Returns the share of each sample in the next plan, [N] of sum 1.
 
-    MPPI's temperature lambda is a multiple of the standard deviation of the returns, so that it
-    means the same for rewards of any scale. Lost samples (-inf) have no share; if all are, the
-    last plan stays.
+    Lost samples (-inf) have no share; if all are, the last plan stays. If all samples are worth
+    exactly the same, a random one is taken: where the reward says nothing, the body moves about and
+    comes to where it says something, instead of lying still.
     """
     sound = jnp.isfinite(returns)
-    best = jax.nn.one_hot(jnp.argmax(returns), len(returns))
+    first, last = jax.nn.one_hot(jnp.array([0, len(returns) - 1]), len(returns))
+    nothing_known = jnp.all(returns == returns[0]) & sound.all()
+    share = jnp.where(nothing_known, last, _shares(settings, returns, sound))
+    return jnp.where(sound.any(), share, first)
+
+
+def _shares(settings: Settings, returns: Array, sound: Array) -> Array:
+    """Returns the shares by the equations of the module.
+
+    MPPI's temperature lambda is a multiple of the standard deviation of the returns, so that it
+    means the same for rewards of any scale.
+    """
     if settings.planner == "predictive_sampling":
-        return best
+        return jax.nn.one_hot(jnp.argmax(returns), len(returns))
     if settings.planner == "mppi":
         count = jnp.maximum(sound.sum(), 1)
         mean = jnp.sum(jnp.where(sound, returns, 0.0)) / count
@@ -215,7 +232,7 @@ def sample_weights(settings: Settings, returns: Array) -> Array:
     else:
         _, places = jax.lax.top_k(returns, settings.elites)
         share = jax.nn.one_hot(places, len(returns)).sum(axis=0) * sound
-    return jnp.where(sound.any(), share / jnp.maximum(share.sum(), EQUAL), best)
+    return share / jnp.maximum(share.sum(), EQUAL)
 
 
 def summarize(settings: Settings, knots: Array, share: Array) -> tuple[Array, Array]:

@@ -20,7 +20,8 @@ class Settings:
     spline: Literal["zero", "linear", "cubic"] = "linear"
     """Actions between knots: the last knot's, a line, or a smooth curve."""
     noise: float = 0.3
-    """Standard deviation of the knots tried around the last plan; actions reach from -1 to 1."""
+    """How far around the last plan knots are tried: their standard deviation is from a quarter of
+    it to four times it, from sample to sample; actions reach from -1 to 1."""
     iterations: int = 1
     """Times that samples are drawn and the plan is improved before each action."""
     temperature: float = 0.3
