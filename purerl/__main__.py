@@ -10,7 +10,7 @@ from purerl.runs.command_errors import leave, tell
 from purerl.runs.experiment import summary
 from purerl.runs.output import show
 
-COMMANDS = ("run", "evaluate", "render", "record", "export", "compare", "report", "plot")
+COMMANDS = ("run", "evaluate", "render", "record", "export", "compare", "report", "plot", "view")
 
 HERE = Path(__file__).parent
 

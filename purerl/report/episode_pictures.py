@@ -48,13 +48,13 @@ def record(setup: Setup, state: TrainState, key: Array, number: int, steps: int)
     """Plays episodes and keeps how every state looked; pure. Arguments: see `play`."""
     end, rows = play(setup, state, key, number, steps)
     states = jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), rows["state"], end.env)
-    pictures = jax.vmap(jax.vmap(functools.partial(_take_picture, setup.env)))(states)
+    pictures = jax.vmap(jax.vmap(functools.partial(take_picture, setup.env)))(states)
     # A lost state is not drawn: it has numbers that no camera can point at.
     shown = jnp.concatenate([jnp.ones((1, number), bool), rows["running"]])
     return Recording(pictures, shown, end.episode.episode_return, end.episode.length, end.over)
 
 
-def _take_picture(env: Any, state: State) -> Picture:
+def take_picture(env: Any, state: State) -> Picture:
     """Keeps what decides how one environment's state looks."""
     changes = env.model_changes(state) if hasattr(env, "model_changes") else {}
     scenery = env.scenery(state) if hasattr(env, "scenery") else ()

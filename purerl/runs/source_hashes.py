@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 PACKAGE = Path(__file__).parent.parent
-AFTERWARDS = {"report"}  # rooms that only look at what a run has written
+AFTERWARDS = {"report", "view"}  # rooms that only look at what a run has written
 
 
 def source_hashes(builders: Iterable[Callable], package: Path = PACKAGE) -> dict[str, str]:
