@@ -137,6 +137,7 @@ class Page:
         self.tab = panel.add_tab("Live")
         with self.tab:
             self.table = self.server.gui.add_html("")
+        self.server.gui.main_panel.dock_right()
         panel.dock_left()
         panel.set_width(PANEL_WIDTH)
 

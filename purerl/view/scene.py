@@ -75,7 +75,8 @@ class Scene:
         faint = bool((batch.opacities < 1).any())
         handle = self.server.scene.add_batched_meshes_simple(
             f"{WORLD}/{name}", batch.mesh.vertices, batch.mesh.faces, where.wxyzs,
-            where.positions, batched_scales=where.scales, batched_colors=shapes.as_light(batch.colors),
+            where.positions, batched_scales=where.scales,
+            batched_colors=shapes.as_light(batch.colors),
             batched_opacities=batch.opacities if faint else None, lod="off",
         )  # fmt: skip
         if batch.moving:
@@ -107,7 +108,8 @@ class Scene:
         if where is not None:
             self.boxes = self.server.scene.add_batched_meshes_simple(
                 f"{WORLD}/scenery", *shapes.unit_box(), where.wxyzs, where.positions,
-                batched_scales=where.scales, batched_colors=shapes.as_light(shapes.SCENERY_COLOR), lod="off",
+                batched_scales=where.scales, lod="off",
+                batched_colors=shapes.as_light(shapes.SCENERY_COLOR),
             )  # fmt: skip
 
     def _aim(self) -> None:

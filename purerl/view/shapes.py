@@ -118,7 +118,7 @@ def scenery_layout(picture: Picture) -> Layout | None:
 
 
 def as_light(colors: np.ndarray) -> np.ndarray:
-    """Returns a screen's colors [..., 3] in proportion to light, as viser takes those of a batch."""
+    """Returns a screen's colors [..., 3] in proportion to light: viser takes a batch's so."""
     return np.asarray(255 * (colors / 255) ** 2.2, np.uint8)
 
 
