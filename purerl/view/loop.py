@@ -2,35 +2,24 @@
 
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.runs.user_code import running
 from purerl.view import session as events
+from purerl.view.opening import Source
 from purerl.view.option_numbers import label
-from purerl.view.page import Page
 from purerl.view.session import Session, advance, to_build
+
+if TYPE_CHECKING:
+    from purerl.view.page import Page
 
 FRAME = 1 / 60  # the least time between two frames [s]
 SAY = 0.2  # between two changes of numbers and plots [s]
 CAME, LEFT = "A browser shows it.", "The last browser left: paused until one opens the page."
 LOOK = 2.0  # between two looks for new checkpoints [s]
-
-
-class Source(NamedTuple):
-    """Where sessions get what takes time, and words; all are called with a session's own values.
-
-    `program(numbers) -> Program` and `brain(name) -> (brain, words)` raise UserError;
-    `checkpoints() -> names`; `words(numbers) -> overrides`; `command(numbers) -> command line`.
-    """
-
-    program: Callable[[Any], Any]
-    brain: Callable[[str], tuple[Any, str]]
-    checkpoints: Callable[[], Sequence[str]]
-    words: Callable[[Any], str]
-    command: Callable[[Any], str]
 
 
 def check_port(host: str, port: int) -> None:
@@ -120,7 +109,7 @@ class Pace:
 
 
 def play(
-    page: Page, session: Session, source: Source, say: Callable[[str], None],
+    page: "Page", session: Session, source: Source, say: Callable[[str], None],
     stop: Callable[[], bool] = lambda: False,
 ) -> Session:  # fmt: skip
     """Plays a session until `stop()`, or Ctrl-C; returns it.

@@ -1,7 +1,8 @@
 """What a window on a run begins with, and where it gets the rest; the run is only read."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
@@ -11,10 +12,23 @@ from purerl.runs.loaded_run import Run, load
 from purerl.runs.output import show
 from purerl.runs.restored_run import read_checkpoint
 from purerl.view import overrides
-from purerl.view.loop import Source
 from purerl.view.option_numbers import replaced
 from purerl.view.program import Brain, Numbers, build_program, policy_driver
 from purerl.view.session import Session, open_session
+
+
+class Source(NamedTuple):
+    """Where sessions get what takes time, and words; all are called with a session's own values.
+
+    `program(numbers) -> Program` and `brain(name) -> (brain, words)` raise UserError;
+    `checkpoints() -> names`; `words(numbers) -> overrides`; `command(numbers) -> command line`.
+    """
+
+    program: Callable[[Any], Any]
+    brain: Callable[[str], tuple[Any, str]]
+    checkpoints: Callable[[], Sequence[str]]
+    words: Callable[[Any], str]
+    command: Callable[[Any], str]
 
 
 def of_run(options: Any) -> tuple[Session, Source, str]:

@@ -199,8 +199,9 @@ def _play(session: Session, seconds: float) -> Session:
     timestep = session.program.env.control_timestep
     most = max(MOST_OWED * session.speed, timestep)
     session = session._replace(owed=min(session.owed + seconds * session.speed, most))
-    while session.playing and session.owed >= timestep:
-        session = take_step(session._replace(owed=session.owed - timestep))
+    due = timestep * (1 - 1e-6)  # sums of floats are a little off
+    while session.playing and session.owed >= due:
+        session = take_step(session._replace(owed=max(0.0, session.owed - timestep)))
     return session
 
 
