@@ -4,6 +4,7 @@ A page in the browser in which the run's policy drives the body, live. Sliders c
 the environment's options. The run's folder is only read, and may be training meanwhile.
 """
 
+import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -30,11 +31,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return carry_out(Options, command, "python -m purerl.view", arguments)
 
 
+def has_viser() -> bool:
+    """Tells whether the package that draws in the browser is installed."""
+    return importlib.util.find_spec("viser") is not None
+
+
 def command(options: Options) -> None:
     """Opens the page and plays until Ctrl-C."""
-    import importlib.util
-
-    if importlib.util.find_spec("viser") is None:
+    if not has_viser():
         raise UserError(
             "The window needs the package viser: pip install -c constraints.txt -e '.[view]'."
         )

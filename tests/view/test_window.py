@@ -1,0 +1,238 @@
+"""The window on a run, in a headless Chromium: its policy, its sliders, its pushes."""
+
+import contextlib
+import json
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from purerl import UserError, load, run as train
+from purerl.core.errors import USAGE
+from purerl.view import __main__ as view
+from purerl.view.option_numbers import replaced
+from purerl.view.program import Brain, build_program, episode_key, policy_driver
+from purerl.view.session import open_session, take_step
+from tests.report import chromium
+from tests.view import sled_experiment as sled
+
+ROOT = Path(__file__).parent.parent.parent
+# A browser without a GPU draws by a program of its own.
+GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+needs_viser = pytest.mark.skipif(not view.has_viser(), reason="pip install -e '.[view]'")
+needs_chromium = pytest.mark.skipif(
+    chromium.find() is None, reason="no Chromium here: apt-get install chromium"
+)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    place = tmp_path_factory.mktemp("view")
+    words = [sled.__file__, "--runs", str(place), "--name", "one", "--checkpoints", "3"]
+    assert train.main(words) == 0
+    return place / "sled_experiment" / "one"
+
+
+def only_line(capsys) -> str:
+    said = capsys.readouterr().err.strip()
+    assert len(said.splitlines()) == 1 and "Traceback" not in said
+    return said
+
+
+# --- the program ---
+
+
+@pytest.fixture(scope="module")
+def made(trained):
+    run = load(trained)
+    driver = policy_driver(run.network, run.state.carry)
+    brain = Brain(run.state.params, run.state.normalizer)
+    options = run.experiment.env
+
+    def make(numbers):
+        build_env = run.experiment.build_env
+        return build_program(build_env, replaced(options, numbers), "c", driver, brain)
+
+    return run, brain, make
+
+
+@pytest.mark.slow
+def test_a_live_number_does_what_a_new_environment_does(made):
+    run, brain, make = made
+    program = make({})
+    assert set(program.live) == {("bonus",), ("weights", 0), ("weights", 1), ("limit",)}
+    assert set(program.fixed) == {("width",)}
+    changed = {("bonus",): 3.5, ("weights", 1): 0.125}
+    built = make(changed)
+    slid = open_session(program, brain, "", 100, 4)
+    slid = slid._replace(numbers=slid.numbers | changed)
+    fresh = open_session(built, brain, "", 100, 4)
+    for _ in range(5):
+        slid, fresh = take_step(slid), take_step(fresh)
+    assert slid.rows[-1].reward == pytest.approx(fresh.rows[-1].reward, abs=1e-6)
+    assert slid.rows[-1].metrics["reward_bonus"] == 3.5
+    # It acts as the run's own policy does.
+    first = run.env.reset(jax.random.fold_in(episode_key(4, 0), 0))
+    run.policy.reset()
+    np.testing.assert_allclose(slid.rows[0].action, run.policy(first.observation), atol=1e-6)
+
+
+@pytest.mark.slow
+def test_options_that_break_a_rule_are_one_line(made):
+    _, _, make = made
+    with pytest.raises(UserError, match=r"width is 2.0; it must be above 0 and below 1."):
+        make({("width",): 2.0})
+
+
+@pytest.mark.slow
+@needs_viser
+def test_mistakes_are_one_line_and_nothing_in_the_run_changes(trained, tmp_path, capsys):
+    assert view.main([str(tmp_path / "none")]) == USAGE
+    assert "none" in only_line(capsys)
+    copy = tmp_path / "one"
+    shutil.copytree(trained, copy)
+    (copy / "checkpoints" / "000000000003" / "meta.json").write_text("{}")
+    assert view.main([str(copy), "--checkpoint", "3", "--port", "0"]) == USAGE
+    assert "damaged" in only_line(capsys)
+    assert view.main([str(trained), "--host", "203.0.113.1"]) == USAGE
+    assert "203.0.113.1:8080 cannot be listened on" in only_line(capsys)
+
+
+# --- the page ---
+
+
+@contextlib.contextmanager
+def opened(trained: Path):
+    """Starts the command; gives its process and the page's address."""
+    words = [sys.executable, "-u", "-m", "purerl.view", str(trained), "--port", "0"]
+    process = subprocess.Popen(
+        words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    try:
+        line = next(line for line in process.stdout if "open http" in line)
+        yield process, line.split("open ")[1].split()[0]
+    finally:
+        process.kill()
+        process.wait(30)
+
+
+class Window:
+    """The page as a person sees and moves it."""
+
+    def __init__(self, browser: chromium.Browser, url: str) -> None:
+        self.browser = browser
+        browser.open(url, 1100, 480)
+        self.wait(lambda: "step " in self.text())
+
+    def text(self) -> str:
+        return self.browser.value("document.body.innerText").replace("\u200b", "")
+
+    def wait(self, so, seconds: float = 30.0) -> None:
+        end = time.monotonic() + seconds
+        while not so():
+            assert time.monotonic() < end, self.text()
+            time.sleep(0.1)
+
+    def steps(self) -> int:
+        return int(self.text().split("step ")[-1].split(",")[0])
+
+    def row(self, name: str) -> list[float]:
+        """The numbers of a line of the table."""
+        line = next(x for x in self.text().splitlines() if x.split()[:1] == [name])
+        return [float(x) for x in line.split()[1:3]]
+
+    def click(self, words: str) -> None:
+        self._mark(f"e.textContent == {json.dumps(words)}", "button")
+        self.browser.click("#marked")
+
+    def choose(self, label: str, option: str) -> None:
+        self._mark(f"e.value == {json.dumps(label)}", "input")
+        self.browser.click("#marked")
+        find = f"e.textContent == {json.dumps(option)}"
+        self.wait(lambda: self._mark(find, "[role=option]", must=False))
+        self.browser.click("#marked")
+
+    def press(self, slider: str, key: str) -> None:
+        """Presses a key on a slider: End is its greatest value."""
+        above = [f"e{'.parentElement' * n}" for n in range(1, 6)]
+        said = f".textContent.replace(/\\u200b/g, '').startsWith({json.dumps(slider)})"
+        find = " || ".join(each + said for each in above)
+        self._mark(find, "[role=slider]")
+        self.browser.value("document.querySelector('#marked').focus()")
+        for kind in ("keyDown", "keyUp"):
+            self.browser.ask("Input.dispatchKeyEvent", type=kind, key=key, code=key)
+
+    def _mark(self, find: str, kind: str, must: bool = True) -> bool:
+        found = self.browser.value(
+            f"""(() => {{ document.querySelector('#marked')?.removeAttribute('id');
+            const e = [...document.querySelectorAll('{kind}')].find(e => {find});
+            if (e) e.id = 'marked'; return !!e }})()"""
+        )
+        assert found or not must, (find, self.text())
+        return found
+
+    def drawn(self, path: Path) -> np.ndarray:
+        """The pixels of the scene."""
+        self.browser.picture(path, whole=False)
+        box = self.browser.value(
+            "document.querySelector('canvas').getBoundingClientRect().toJSON()"
+        )
+        self.center = box["left"] + box["width"] / 2, box["top"] + box["height"] / 2
+        with Image.open(path) as image:
+            part = (box["left"], box["top"], box["right"], box["bottom"])
+            return np.asarray(image.convert("RGB").crop(tuple(map(int, part))), int)
+
+
+@pytest.mark.slow
+@needs_viser
+@needs_chromium
+def test_a_person_plays_with_a_run(trained, tmp_path):
+    before = {p: p.stat().st_mtime_ns for p in trained.rglob("*") if p.is_file()}
+    with opened(trained) as (process, url), chromium.browser(*GL) as browser:
+        assert url.startswith("http://127.0.0.1:")
+        window = Window(browser, url)
+        assert "of update 3 (96 steps)" in window.text()
+        # It moves, until it is told not to, and then step by step.
+        steps = window.steps()
+        window.wait(lambda: window.steps() > steps)
+        window.click("Pause")
+        window.wait(lambda: "paused" in window.text())
+        steps = window.steps()
+        window.click("Step")
+        window.wait(lambda: window.steps() == steps + 1)
+        # A slider changes the reward of the very next step, and says how to train so.
+        assert window.row("bonus")[0] == 1.0
+        window.press("bonus", "End")
+        window.wait(lambda: "--env.bonus 4.0" in window.text())
+        window.click("Step")
+        window.wait(lambda: window.row("bonus")[0] == 4.0)
+        window.click("Train this")
+        window.wait(lambda: "purerl.run" in window.text())
+        # Another checkpoint.
+        window.choose("latest", "1")
+        window.wait(lambda: "of update 1 (32 steps)" in window.text())
+        # The mouse holds the box and draws it up.
+        still = window.drawn(tmp_path / "still.png")
+        x, y = window.center
+        browser.drag([(x, y), (x, y - 20), (x, y - 60)])
+        window.click("Play")
+        window.wait(lambda: window.row("height")[0] > 0.05)
+        assert np.abs(window.drawn(tmp_path / "moved.png") - still).max() > 60
+        browser.drop((x, y - 60))
+        # A number that shapes the model takes a new program, and a broken rule is told.
+        window.press("width", "End")
+        window.wait(lambda: "width is 1.2" in window.text())
+        # An environment that ends at once.
+        window.press("limit", "Home")
+        window.wait(lambda: "ends at its first step" in window.text())
+        browser.ask("Page.navigate", url="about:blank")
+        assert "The last browser left" in next(x for x in process.stdout if "last" in x)
+        assert [e for e in browser.said if e["method"] == "Runtime.exceptionThrown"] == []
+        assert all(u.startswith((url, "data:", "blob:")) for u in browser.requested)
+    assert {p: p.stat().st_mtime_ns for p in trained.rglob("*") if p.is_file()} == before
