@@ -10,7 +10,9 @@ from purerl.runs.command_errors import leave, tell
 from purerl.runs.experiment import summary
 from purerl.runs.output import show
 
-COMMANDS = ("run", "evaluate", "render", "record", "export", "compare", "report", "plot", "view")
+COMMANDS = (
+    "run", "evaluate", "render", "view", "record", "export", "compare", "report", "plot", "plan",
+)  # fmt: skip
 
 HERE = Path(__file__).parent
 

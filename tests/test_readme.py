@@ -68,14 +68,15 @@ def help_page(*words):
 def all_help():
     """Returns the help pages of all our commands, those of `run` for two experiments."""
     pages = [help_page("purerl.run", name) for name in ("ant_gaps", "suite")]
-    names = ("evaluate", "render", "compare", "record", "export", "report", "plot")
+    names = ("evaluate", "render", "compare", "record", "export", "report", "plot", "plan")
     return "".join([*pages, *(help_page(f"purerl.{name}") for name in names)])
 
 
 def unknown_options(words):
     """Returns the options of one of our commands that its help page does not have."""
     module, *rest = words
-    page = help_page(module, *rest[: module == "purerl.run"])
+    named = rest[: module in ("purerl.run", "purerl.plan")]
+    page = help_page(module, *(re.sub(r"^runs/(\w+)/.*", r"\1", name) for name in named))
     return [word for word in options(rest) if not re.search(rf"{re.escape(word)}\b", page)]
 
 

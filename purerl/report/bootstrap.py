@@ -65,6 +65,11 @@ def resample(strata: Sequence[Values], seed: int, number: int = RESAMPLES) -> li
     return [s[generator.integers(0, len(s), (number, len(s)))] for s in strata]
 
 
+def mean_interval(values: Values, seed: int = 0) -> Interval | None:
+    """Returns the bootstrap interval of the mean of values [n]; None for too few."""
+    return _interval(lambda strata: strata[0].mean(axis=-1), [[values]], seed)
+
+
 def iqm_interval(strata: Sequence[Values], seed: int = 0) -> Interval | None:
     """Returns the stratified bootstrap interval of the IQM; None for too few runs."""
     return _interval(pooled_iqm, [strata], seed)

@@ -43,26 +43,14 @@ def make_video(
       UserError: the run, the checkpoint or the camera is not one.
       RunError: there is no OpenGL, or the files cannot be written.
     """
-    physics: Any = getattr(run.env, "physics", None)
     timestep = run.env.control_timestep
-    if not hasattr(physics, "model"):
-        raise UserError(
-            f"The environment {type(run.env).__name__} cannot be drawn: it has no `physics` of the "
-            "type purerl.Physics."
-        )
-    try:
-        renderer = Renderer(physics.model, *size, camera)
-    except ValueError as error:
-        raise UserError(str(error)) from error
     # The files are named after the update, and after what is not the default.
     words = [f"{run.update:012d}", camera.replace("/", "-"), f"seed{seed}" if seed else ""]
     path = run.folder / "videos" / f"{'_'.join(filter(None, words))}.mp4"
-    with renderer:
+    with renderer_of(run.env, size, camera) as renderer:
         recording = _play(run, episodes, seconds, seed)
-        stride = frame_stride(timestep)
-        pictures = [episode_pictures(recording, i, stride) for i in range(episodes)]
-        frames = (frame for each in pictures for frame in renderer.draw_episode(each))
-        _write_files(path, frames, sum(map(len, pictures)), size, 1.0 / (stride * timestep))
+        check_inside(run.folder, path.parent)
+        draw(path, renderer, recording, timestep)
     told = zip(recording.length, recording.over, recording.episode_return, strict=True)
     lines = [
         f"update {run.update:,}, episode {i + 1}: {length * timestep:.1f} s "
@@ -73,6 +61,29 @@ def make_video(
     with contextlib.suppress(UserError):  # metrics that cannot be read spoil no video
         lines += beside_evaluation(run_reader.read(run.folder).lines, run.update, whole)
     return path, lines
+
+
+def renderer_of(env: Any, size: tuple[int, int], camera: str = "") -> Renderer:
+    """Returns a renderer for an environment, to be used in a `with`; see `make_video`."""
+    physics: Any = getattr(env, "physics", None)
+    if not hasattr(physics, "model"):
+        raise UserError(
+            f"The environment {type(env).__name__} cannot be drawn: it has no `physics` of the "
+            "type purerl.Physics."
+        )
+    try:
+        return Renderer(physics.model, *size, camera)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+
+
+def draw(path: Path, renderer: Renderer, recording: Recording, timestep: float) -> None:
+    """Writes the video of recorded episodes with steps of `timestep` [s], and a contact sheet."""
+    stride, size = frame_stride(timestep), (renderer.size.width, renderer.size.height)
+    episodes = range(len(recording.length))
+    pictures = [episode_pictures(recording, i, stride) for i in episodes]
+    frames = (frame for each in pictures for frame in renderer.draw_episode(each))
+    _write_files(path, frames, sum(map(len, pictures)), size, 1.0 / (stride * timestep))
 
 
 def beside_evaluation(
@@ -113,7 +124,6 @@ def _write_files(
 ) -> None:
     """Writes a video of `number` frames and, beside it, its contact sheet; each whole or not."""
     drafts = {kind: path.with_name(f".{path.stem}{kind}") for kind in (".png", ".mp4")}
-    check_inside(path.parent.parent, path.parent)
     try:
         path.parent.mkdir(exist_ok=True)
         for draft in drafts.values():  # it may be a link, to be written through

@@ -41,31 +41,39 @@ def carry_out(
 
 
 def from_command_line(
-    source: Source, arguments: Sequence[str], prog: str, config: Any = CONFIG
-) -> tuple[Experiment, Options]:
-    """Returns the experiment with its overrides, and the run's options.
+    source: Source,
+    arguments: Sequence[str],
+    prog: str,
+    config: Any = CONFIG,
+    base: Any = Options,
+    names: Sequence[str] = (),
+) -> tuple[Experiment, Any]:
+    """Returns the experiment with its overrides, and the command's options.
 
     Args:
       source: the experiment.
       arguments: the command line after the experiment's name.
       prog: the command before `arguments`, for the help page and for errors.
       config: tyro's markers.
+      base: the dataclass of the command's options.
+      names: of the experiment's settings that can be overridden; none: all.
 
     Raises:
       UserError: there is no such option, or a value is wrong.
     """
     values = experiment.settings(source.experiment)
+    values = {name: values[name] for name in names or values}
     kinds = {f.name: f.type for f in dataclasses.fields(Experiment)}
     kinds |= {name: type(v) for name, v in values.items() if dataclasses.is_dataclass(v)}
     # A class made for this experiment: its settings have the types of their values, which is all
     # that the command line needs to know, so an environment's options need no registration.
     fields = [(name, kinds[name], dataclasses.field(kw_only=True)) for name in values]
-    both = dataclasses.make_dataclass("Settings", fields, bases=(Options,), frozen=True)
+    both = dataclasses.make_dataclass("Settings", fields, bases=(base,), frozen=True)
     both.__doc__ = experiment.summary(source.path) or f"Trains {source.name}."
     parsed = parse(both, arguments, prog, both(**values), config)
     overrides = {name: getattr(parsed, name) for name in values}
-    options = {f.name: getattr(parsed, f.name) for f in dataclasses.fields(Options)}
-    return dataclasses.replace(source.experiment, **overrides), Options(**options)
+    options = {f.name: getattr(parsed, f.name) for f in dataclasses.fields(base)}
+    return dataclasses.replace(source.experiment, **overrides), base(**options)
 
 
 def from_settings(

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 PACKAGE = Path(__file__).parent.parent
-AFTERWARDS = {"report", "view"}  # rooms that only look at what a run has written
+AFTERWARDS = {"plan", "report", "view"}  # rooms that only look at what a run has written
 
 
 def source_hashes(builders: Iterable[Callable], package: Path = PACKAGE) -> dict[str, str]:

@@ -15,34 +15,17 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from purerl.core.env import Env, State
+from purerl.core.env import State
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.keys import Purpose, derive
-from purerl.core.records import Array, Network, PyTree
+from purerl.core.records import Array, PyTree
 from purerl.devices.compilation import jit, start as compile_beside
-from purerl.ppo import distributions, rollout, running_moments
+from purerl.ppo import rollout
 from purerl.report.episode_pictures import Picture, take_picture
+from purerl.view.drivers import Driver
 from purerl.view.option_numbers import Place, numbers_of, replaced
 
 Numbers = Mapping[Place, int | float]
-
-
-class Driver(NamedTuple):
-    """Who chooses the actions: a trained policy, or a planner; pure functions.
-
-    `start(env, state) -> memory`: at the first state of an episode.
-    `act(env, brain, state, memory, key) -> (action [A], value [], memory)`.
-    """
-
-    start: Callable[[Env, State], PyTree]
-    act: Callable[[Env, PyTree, State, PyTree, Array], tuple[Array, Array, PyTree]]
-
-
-class Brain(NamedTuple):
-    """What a policy has learned: another checkpoint is another brain, and no other program."""
-
-    params: PyTree
-    normalizer: PyTree
 
 
 class Moment(struct.PyTreeNode):
@@ -75,25 +58,6 @@ class Program(NamedTuple):
     fixed: dict[Place, int | float]  # numbers that it was built with
     start: Callable[[Numbers, Array], tuple[Moment, Picture]]
     step: Callable[[Numbers, PyTree, Moment], tuple[Moment, Shown]]
-
-
-def policy_driver(network: Network, carry: PyTree) -> Driver:
-    """Returns the driver that takes the centre of a policy's distribution.
-
-    Args:
-      network: the network.
-      carry: one like a TrainState's, [B, ...], for the shape of one environment's memory.
-    """
-
-    def start(env: Env, state: State) -> PyTree:
-        return jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), carry)
-
-    def act(env: Env, brain: Brain, state: State, memory: PyTree, key: Array) -> Any:
-        observation = running_moments.normalize(brain.normalizer, state.observation)
-        output, memory = network.apply(brain.params, observation, memory)
-        return distributions.to_action(output.distribution.loc), output.value, memory
-
-    return Driver(start, act)
 
 
 def episode_key(seed: int, episode: int) -> Array:
@@ -207,7 +171,7 @@ def find_live(build: Callable[[Numbers], Any], numbers: Numbers) -> dict[Place, 
 def begin(env: Any, driver: Driver, key: Array) -> tuple[Moment, Picture]:
     """Starts an episode."""
     state = env.reset(jax.random.fold_in(key, 0))
-    first = Moment(state, driver.start(env, state), key, jnp.zeros((), jnp.int32))
+    first = Moment(state, driver.start(env), key, jnp.zeros((), jnp.int32))
     return first, take_picture(env, state)
 
 

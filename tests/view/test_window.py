@@ -1,6 +1,7 @@
 """The window on a run, in a headless Chromium: its policy, its sliders, its pushes."""
 
 import contextlib
+import functools
 import json
 import shutil
 import subprocess
@@ -15,9 +16,11 @@ from PIL import Image
 
 from purerl import UserError, load, run as train
 from purerl.core.errors import USAGE
+from purerl.plan import planner
 from purerl.view import __main__ as view
+from purerl.view.drivers import policy_driver
 from purerl.view.option_numbers import replaced
-from purerl.view.program import Brain, build_program, episode_key, policy_driver
+from purerl.view.program import build_program, episode_key
 from purerl.view.session import open_session, take_step
 from tests.report import chromium
 from tests.view import sled_experiment as sled
@@ -51,8 +54,8 @@ def only_line(capsys) -> str:
 @pytest.fixture(scope="module")
 def made(trained):
     run = load(trained)
-    driver = policy_driver(run.network, run.state.carry)
-    brain = Brain(run.state.params, run.state.normalizer)
+    brain = run.state
+    driver = policy_driver(functools.partial(planner.guide, run.config, run.network), brain)
     options = run.experiment.env
 
     def make(numbers):
@@ -160,7 +163,7 @@ class Window:
 
     def press(self, slider: str, key: str) -> None:
         """Presses a key on a slider: End is its greatest value."""
-        above = [f"e{'.parentElement' * n}" for n in range(1, 6)]
+        above = [f"e{'.parentElement' * n}" for n in range(5, 9)]
         said = f".textContent.replace(/\\u200b/g, '').startsWith({json.dumps(slider)})"
         find = " || ".join(each + said for each in above)
         self._mark(find, "[role=slider]")

@@ -1,0 +1,84 @@
+"""What planned episodes were like, in figures: returns, every metric, both rewards."""
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from purerl.report.bootstrap import LEAST_RUNS, mean_interval
+
+Figures = dict[str, np.ndarray]  # name -> [E]
+RETURN = "episode_return"
+
+
+def table(groups: Mapping[str, Figures]) -> list[str]:
+    """Returns lines with mean and 95% interval of every figure, the return first.
+
+    With two groups, the episodes of which begin alike, also of the difference, episode by episode.
+    """
+    first, *rest = groups.values()
+    names = dict.fromkeys([RETURN, *sorted(set(first).union(*rest))])
+    columns = {name: [said(group.get(row)) for row in names] for name, group in groups.items()}
+    if rest:
+        columns["difference"] = [
+            said(rest[0][row] - first[row] if row in first and row in rest[0] else None)
+            for row in names
+        ]
+    lines = [["", *columns], *([n, *row] for n, *row in zip(names, *columns.values(), strict=True))]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    cells = [[f"{x:>{w}}" for x, w in zip(line, widths, strict=True)] for line in lines]
+    printed = ["  ".join([row[0].strip().ljust(widths[0]), *row[1:]]) for row in cells]
+    few = len(first[RETURN]) < LEAST_RUNS
+    return printed + [f"Intervals need {LEAST_RUNS} episodes: --episodes {LEAST_RUNS}"] * few
+
+
+def said(values: np.ndarray | None) -> str:
+    """Returns mean and interval of values [E] as text."""
+    if values is None:
+        return ""
+    interval = mean_interval(values)
+    known = "" if interval is None else f" [{interval.low:.4g}, {interval.high:.4g}]"
+    return f"{values.mean():.4g}{known}"
+
+
+def rows(groups: Mapping[str, Figures]) -> str:
+    """Returns CSV: a row for each episode of each group."""
+    names = dict.fromkeys(name for figures in groups.values() for name in figures)
+    written = io.StringIO()
+    writer = csv.DictWriter(written, ["settings", "episode", *names], lineterminator="\n")
+    writer.writeheader()
+    for group, figures in groups.items():
+        for episode in range(len(figures[RETURN])):
+            values = {name: float(values[episode]) for name, values in figures.items()}
+            writer.writerow({"settings": group, "episode": episode} | values)
+    return written.getvalue()
+
+
+def as_json(groups: Mapping[str, Figures], about: Mapping[str, Any]) -> str:
+    """Returns JSON: what was asked for, and every figure with its values, mean and interval."""
+    found = {
+        group: {
+            name: {"mean": float(x.mean()), "interval": mean_interval(x), "values": x.tolist()}
+            for name, x in figures.items()
+        }
+        for group, figures in groups.items()
+    }
+    return json.dumps({**about, "figures": found}, indent=2, default=str) + "\n"
+
+
+def judged(rows: Sequence[Mapping[str, Any]]) -> Figures:
+    """Returns each judge's return of the episodes, of the rows of `episodes.advance`."""
+    return {
+        f"return under {name}": total(
+            np.where(row["running"], row["judged"][name], 0.0) for row in rows
+        )
+        for name in rows[0]["judged"]
+    }
+
+
+def total(parts: Iterable[np.ndarray]) -> np.ndarray:
+    """Sums arrays [T, E] over time and parts, [E]."""
+    return np.sum([part.sum(axis=0, dtype=float) for part in parts], axis=0)
