@@ -178,14 +178,16 @@ class Page:
         self._draw_plots(session)
 
     def _draw_plots(self, session: Session) -> None:
-        """Draws the lines; a plot begins with its first points, which set its scale."""
+        """Draws the lines; with fewer than two points uPlot has no scale, and they stay."""
         for title, plot_of in PLOTS.items():
             plot = plot_of(session)
+            if len(plot.columns[0]) < 2:
+                continue
             if title in self.plots:
                 self.plots[title].data = plot.columns
                 if self.names[title] != plot.names:
                     self.plots[title].series = _series(plot.names)
-            elif len(plot.columns[0]) > 1:
+            else:
                 with self.tab:
                     self.plots[title] = self.server.gui.add_uplot(
                         data=plot.columns, series=_series(plot.names), title=title,
