@@ -68,7 +68,7 @@ def help_page(*words):
 def all_help():
     """Returns the help pages of all our commands, those of `run` for two experiments."""
     pages = [help_page("purerl.run", name) for name in ("ant_gaps", "suite")]
-    names = ("evaluate", "render", "compare", "record", "export", "report", "plot", "plan")
+    names = ("evaluate", "render", "compare", "record", "export", "report", "plot", "plan", "view")
     return "".join([*pages, *(help_page(f"purerl.{name}") for name in names)])
 
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from purerl.view.page import Page
 
 FRAME = 1 / 60  # the least time between two frames [s]
+LONGEST = 1 / 25  # what is played between two frames, so that slow plans show too [s]
 SAY = 0.2  # between two changes of numbers and plots [s]
 CAME, LEFT = "A browser shows it.", "The last browser left: paused until one opens the page."
 LOOK = 2.0  # between two looks for new checkpoints [s]
@@ -127,7 +128,7 @@ def play(
             watched = page.watched
             say(CAME if watched else LEFT)
         now = time.perf_counter()
-        tick = [events.Tick(now - last)] if watched else []
+        tick = [events.Tick(min(now - last, LONGEST))] if watched else []
         before, last = session, now
         session, failed = _advance(session, [*page.happened(), *beside.finished(), *tick])
         if failed:

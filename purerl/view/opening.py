@@ -69,8 +69,9 @@ def _of_run(options: Any) -> tuple[Session, Source, str]:
         brain=other_brain,
         checkpoints=lambda: checkpoint_names(run.folder, options.checkpoint),
     )
+    words = _words(run.update, run.steps)
     title = f"{run.folder.absolute().parent.name}/{run.folder.absolute().name}"
-    return _open(source, setup, brain, _words(run.update, run.steps), options), source, title
+    return _open(source, setup, brain, words, options), source, title
 
 
 def _of_experiment(options: Any) -> tuple[Session, Source, str]:
@@ -81,8 +82,7 @@ def _of_experiment(options: Any) -> tuple[Session, Source, str]:
     setup, name = build(found.experiment), str(options.run)
     driver = planner_driver(options, lambda _: planner.unguided(setup.env.action_size), ())
     source = _source(setup, driver, (), found.experiment, found.experiment, name)
-    words = f"none: {options.planner}, {options.samples} plans of {options.horizon} steps"
-    return _open(source, setup, (), words, options), source, found.name
+    return _open(source, setup, (), _plans(options), options), source, found.name
 
 
 def _source(
@@ -124,7 +124,11 @@ def _open(source: Source, setup: Setup, brain: Any, words: str, options: Any) ->
 
 
 def _words(update: int, steps: int) -> str:
-    return f"of update {update:,} ({steps:,} steps)"
+    return f"policy of update {update:,} ({steps:,} steps)"
+
+
+def _plans(options: Any) -> str:
+    return f"{options.planner}, {options.samples} plans of {options.horizon} steps"
 
 
 def checkpoint_names(folder: Path, first: str) -> list[str]:

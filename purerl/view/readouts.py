@@ -85,7 +85,7 @@ def status_lines(session: Session, pace: str) -> list[str]:
     timestep = session.program.env.control_timestep
     doing = pace if session.playing else "paused"
     return [
-        f"checkpoint {session.checkpoint}, seed {session.seed}, episode {session.episode}",
+        f"{session.checkpoint}, seed {session.seed}, episode {session.episode}",
         f"{session.length * timestep:.2f} s, step {session.length}, "
         f"return {session.sums.get('reward', 0.0):.4g} ({doing})",
         *([session.ended] if session.ended else []),

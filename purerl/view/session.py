@@ -36,7 +36,7 @@ class Session(NamedTuple):
 
     program: Program
     brain: Any
-    checkpoint: str  # what `brain` is, in words
+    checkpoint: str  # what `brain` is, or who plans, in words
     numbers: dict[Place, int | float]  # the sliders
     limit: int  # control steps of an episode
     seed: int

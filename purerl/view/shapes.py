@@ -4,7 +4,7 @@ A batch is one mesh, drawn many times, each with a place, a rotation and a size 
 body is a handful of messages a frame, and a corridor whose boxes move and stretch from step to
 step costs no more than one that does not. (mjviser, which draws MuJoCo's models in the same
 browser page, bakes every geom into a mesh when it starts. To show another gap it would make all
-meshes anew: measured in docs/howto/view.md.)
+meshes anew: 0.3 s for an ant, 0.9 s for a rodent, against 0.2 ms: docs/howto/view.md.)
 """
 
 from typing import Any, NamedTuple
