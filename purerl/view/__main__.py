@@ -66,6 +66,8 @@ def command(options: Options) -> None:
     session, source, title = opening.open_window(options)
     page = Page(options.host, options.port, title)
     try:
+        if options.port not in (0, page.port):  # viser takes the next one
+            raise UserError(f"Port {options.port} was taken meanwhile: give another, as --port.")
         show(f"{title}: open http://{options.host}:{page.port} in a browser; Ctrl-C ends.")
         play(page, session, source, lambda line: show(line))
     except KeyboardInterrupt:

@@ -14,10 +14,10 @@ XML = """
   <option gravity="0 0 0" timestep="0.01"/>
   <worldbody>
     <body name="box">
-      <joint name="x" type="slide" axis="1 0 0"/>
+      <joint name="x" type="slide" axis="1 0 0" damping="0.2"/>
       <joint name="y" type="slide" axis="0 1 0"/>
       <joint name="z" type="slide" axis="0 0 1"/>
-      <geom name="box" type="box" size="{width} 0.3 0.3" rgba="0.8 0.4 0.1 1"/>
+      <geom name="box" type="box" mass="0.5" size="{width} 0.3 0.3" rgba="0.8 0.4 0.1 1"/>
     </body>
   </worldbody>
   <actuator><motor joint="x" ctrlrange="-1 1"/></actuator>

@@ -1,6 +1,7 @@
 """The window on a run, in a headless Chromium: its policy, its sliders, its pushes."""
 
 import contextlib
+import dataclasses
 import functools
 import json
 import shutil
@@ -17,11 +18,11 @@ from PIL import Image
 from purerl import UserError, load, run as train
 from purerl.core.errors import USAGE
 from purerl.plan import planner
-from purerl.view import __main__ as view
+from purerl.view import __main__ as view, opening
 from purerl.view.drivers import policy_driver
 from purerl.view.option_numbers import replaced
 from purerl.view.program import build_program, episode_key
-from purerl.view.session import open_session, take_step
+from purerl.view.session import Push, Step, advance, open_session, take_step
 from tests.report import chromium
 from tests.view import sled_experiment as sled
 
@@ -91,6 +92,27 @@ def test_options_that_break_a_rule_are_one_line(made):
     _, _, make = made
     with pytest.raises(UserError, match=r"width is 2.0; it must be above 0 and below 1."):
         make({("width",): 2.0})
+
+
+@pytest.mark.slow
+def test_the_planner_drives_an_experiment(trained):
+    """By the best of its plans: to be still at x = 0 costs least, and a push is braked."""
+    options = view.Options(run=Path(sled.__file__), samples=32, horizon=10, seed=1)
+    session, source, title = opening.open_window(options)
+    assert title == "sled_experiment" and source.checkpoints() == ()
+    session = advance(session, [Push((1.0, 0.0, 0.0)), Step()])
+    for _ in range(40):
+        session = take_step(session)
+    speeds = [-row.metrics["reward_slow"] / 0.25 for row in session.rows]
+    assert speeds[0] > 0.9 and speeds[-1] < 0.5 * speeds[0]
+    assert all(row.action[0] < 0 for row in session.rows[:5])
+    # Of a run, plans begin with what the policy does.
+    of_run = view.Options(run=trained, drive="planner", samples=8, horizon=2)
+    session, source, _ = opening.open_window(of_run)
+    assert take_step(session).length == 1
+    assert source.command({("bonus",): 2.0}).endswith("sled_experiment.py --env.bonus 2.0")
+    with pytest.raises(UserError, match="is no run's folder"):
+        opening.open_window(dataclasses.replace(options, drive="policy"))
 
 
 @pytest.mark.slow
