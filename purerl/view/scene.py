@@ -120,7 +120,7 @@ class Scene:
         radius = float(np.max(away + self.model.geom_rbound[own], initial=0.05))
         camera, height = self.server.initial_camera, float(center[2])
         camera.look_at = (0.0, 0.0, height)
-        camera.position = (-0.8 * radius, -3.0 * radius, height + 1.2 * radius)
+        camera.position = (-0.6 * radius, -2.4 * radius, height + 0.9 * radius)
         camera.near = radius / 100
 
 

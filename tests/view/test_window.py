@@ -94,6 +94,24 @@ def test_options_that_break_a_rule_are_one_line(made):
         make({("width",): 2.0})
 
 
+@dataclasses.dataclass(frozen=True)
+class Nothing:
+    """The options of an environment without any."""
+
+
+@pytest.mark.slow
+def test_an_environment_without_options_has_no_sliders(made):
+    run, brain, _ = made
+    driver = policy_driver(functools.partial(planner.guide, run.config, run.network), brain)
+
+    def build(options, engine):
+        return sled.build(sled.Options(bonus=2.5), engine)
+
+    program = build_program(build, Nothing(), "c", driver, brain)
+    session = take_step(open_session(program, brain, "", 100, 0))
+    assert session.numbers == {} and session.rows[0].metrics["reward_bonus"] == 2.5
+
+
 @pytest.mark.slow
 def test_the_planner_drives_an_experiment(trained):
     """By the best of its plans: to be still at x = 0 costs least, and a push is braked."""
