@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from purerl.core.errors import UserError
+from purerl.core.errors import UserError, one_line
 from purerl.core.records import TrainState
 from purerl.devices.compilation import set_up_jax
 from purerl.plan import planner
@@ -106,10 +106,17 @@ def _source(
         return build_program(chosen.build_env, changed, setup.engine, driver, brain, known)
 
     def words(numbers: Numbers) -> str:
-        return " ".join(overrides.environment_words(written, replaced(chosen.env, numbers)))
+        try:
+            return " ".join(overrides.environment_words(written, replaced(chosen.env, numbers)))
+        except Exception as error:  # a rule of the options, until the sliders are taken back
+            return one_line(error)
 
     def command(numbers: Numbers) -> str:
-        return overrides.train_command(name, written, chosen, replaced(chosen.env, numbers))
+        try:
+            changed = replaced(chosen.env, numbers)
+            return overrides.train_command(name, written, chosen, changed)
+        except Exception as error:
+            return one_line(error)
 
     return Source(program, _no_brain, tuple, words, command)
 

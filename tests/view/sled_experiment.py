@@ -31,6 +31,11 @@ class Options:
     weights: tuple[float, float] = (0.5, 0.25)
     limit: float = 100.0
     width: float = 0.3
+    span: tuple[float, float] = (0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        if not self.span[0] < self.span[1]:
+            raise ValueError(f"span is {self.span}; give least < greatest.")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -71,7 +71,7 @@ def test_a_live_number_does_what_a_new_environment_does(made):
     run, brain, make = made
     program = make({})
     assert set(program.live) == {("bonus",), ("weights", 0), ("weights", 1), ("limit",)}
-    assert set(program.fixed) == {("width",)}
+    assert set(program.fixed) == {("width",), ("span", 0), ("span", 1)}
     changed = {("bonus",): 3.5, ("weights", 1): 0.125}
     built = make(changed)
     slid = open_session(program, brain, "", 100, 4)
@@ -129,6 +129,8 @@ def test_the_planner_drives_an_experiment(trained):
     session, source, _ = opening.open_window(of_run)
     assert take_step(session).length == 1
     assert source.command({("bonus",): 2.0}).endswith("sled_experiment.py --env.bonus 2.0")
+    assert source.words({("span", 0): 1.0}) == source.command({("span", 0): 1.0})
+    assert source.words({("span", 0): 1.0}) == "span is (1.0, 1.0); give least < greatest."
     with pytest.raises(UserError, match="is no run's folder"):
         opening.open_window(dataclasses.replace(options, drive="policy"))
 
@@ -267,6 +269,9 @@ def play(window: Window, tmp_path: Path) -> None:
     # A number that shapes the model takes a new program, and a broken rule is told.
     window.press("width", "End")
     window.wait(lambda: "width is 1.2" in window.text())
+    window.press("span[0]", "End")
+    window.wait(lambda: "span is (1.0, 1.0)" in window.text())
+    window.wait(lambda: "--env.bonus 4.0" in window.text())
     # An environment that ends at once.
     window.press("limit", "Home")
     window.wait(lambda: "ends at its first step" in window.text())
