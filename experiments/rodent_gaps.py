@@ -11,7 +11,7 @@ H200, one seed gallops at 1.8 m/s over every gap (23.9 in 10 s, 21 at least), an
 python -m purerl.run rodent_gaps --engine warp --ppo.num-envs 4096 --ppo.rollout-length 16 \
     --ppo.num-minibatches 64 --ppo.num-steps 160000000
 
-`docs/gpu.md` has their curves, and other rewards and settings over 21 M steps.
+`docs/measurements/gpu.md` has their curves, and other rewards and settings over 21 M steps.
 """
 
 from envs import run

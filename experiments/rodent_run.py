@@ -3,8 +3,8 @@
 python -m purerl.run rodent_run
 
 Expected: 1.7 m/s over 10 s episodes, head first, after 11 min on two CPU cores. With MJX-Warp
-(`docs/gpu.md` has the command) 2.4 m/s after 21 M steps, 7 min of an H200 that trains another
-beside it.
+(`docs/measurements/gpu.md` has the command) 2.4 m/s after 21 M steps, 7 min of an H200 that trains
+another beside it.
 """
 
 from envs import run

@@ -1,8 +1,8 @@
-"""dm_control's control suite, 19 of its tasks with the same settings.
+"""dm_control's control suite, all 28 tasks of its benchmark with the same settings.
 
 python -m purerl.run suite --env.task cheetah-run --name cheetah-run
 
-Expected: return 600 of 1000 after 3 min, on two CPU cores; the other tasks: docs/suite.md.
+Expected: return 600 of 1000 after 3 min, on two CPU cores; others: docs/measurements/suite.md.
 """
 
 from envs.suite import tasks

@@ -26,6 +26,7 @@ A network:
 
 Other:
   adapters: a package: our environments for Gymnasium and dm_env; brax's and Playground's for us.
+  planner: a module: behaviour by search in the simulation, without learning.
   exact: a package: programs of MJX with their sums in a fixed order, without the trainer.
   Array, PyTree: for type annotations.
   UserError, RunError, StoppedError: a wrong call; a run that cannot go on; one that was stopped.
@@ -39,7 +40,7 @@ import sys
 from typing import Any
 
 __version__ = "0.1.0"
-# Module -> its public names, as in `__init__.pyi`; adapters, exact, lookup, networks are modules.
+# Module -> its public names, as in `__init__.pyi`. A name that is its module's own is a module.
 _NAMES = {
     "adapters": "adapters",
     "core.env": "Env EnvError State",
@@ -48,6 +49,7 @@ _NAMES = {
     "exact": "exact",
     "physics.interface": "Physics PhysicsState choose_engine overflow_metric overflow_reading",
     "physics.lookup": "lookup",
+    "plan.planner": "planner",
     "ppo.config": "Config Evaluation",
     "ppo.networks": "networks",
     "runs.check_env": "check_env",

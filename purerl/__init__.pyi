@@ -21,6 +21,7 @@ from purerl.physics.interface import (
     overflow_metric as overflow_metric,
     overflow_reading as overflow_reading,
 )
+from purerl.plan import planner as planner
 from purerl.ppo import networks as networks
 from purerl.ppo.config import Config as Config, Evaluation as Evaluation
 from purerl.runs.check_env import check_env as check_env

@@ -1,7 +1,7 @@
 """Takes a policy away: `python -m purerl.export RUN [--format npz|jax|onnx] [--out F]`.
 
-Normalization, memory and squashing are inside the file; docs/export.md shows how to read it. The
-policy acts by its distribution's centre. It is played on whole episodes, and how far the file's
+Normalization, memory and squashing are inside the file; docs/howto/export.md shows how to read it.
+The policy acts by its distribution's centre. It is played on whole episodes, and how far the file's
 actions are from the run's own is printed.
 
     npz    arrays by name, for numpy: networks.mlp and networks.recurrent

@@ -16,6 +16,7 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import USAGE, RunError, StoppedError, UserError, one_line
@@ -68,29 +69,45 @@ def _command(arguments: Sequence[str]) -> None:
     prog = f"python -m purerl.run {arguments[0]}"
     chosen, options = from_command_line(source, arguments[1:], prog)
     # Before mujoco is imported, which looks for OpenGL itself.
-    video = options.video and _attempt(choose_gl)
+    video = options.video and _attempt("video", choose_gl)
     folders = training.train_runs(source, chosen, options, os._exit)
     if video:
         from purerl.devices.processes import is_first
 
         if is_first():
-            _attempt(_show_policy, render.Options(folders[0], trust=True))
+            shown = render.Options(folders[0], trust=True)
+            files: list[str] = []
+            if _attempt("video", _show_policy, shown, files):
+                _attempt("video for the loggers", _log_video, options, folders[0], files[-1])
 
 
-def _show_policy(options: Any) -> None:
-    """Makes a video; training has ended, and nothing that cannot be printed is a failure of it."""
+def _show_policy(options: Any, files: list[str]) -> None:
+    """Makes a video, and adds its path to `files`.
+
+    Training has ended, and nothing that cannot be printed is a failure of it.
+    """
     from purerl import render
 
-    for line in render.make(options):
+    for line in (lines := render.make(options)):
+        output.say(line)
+    files.append(lines[-1])
+
+
+def _log_video(options: Any, folder: Path, video: str) -> None:
+    """Hands the video to TensorBoard and W&B, if the run has them."""
+    from purerl.report.video_loggers import log_video
+
+    path = Path(video)
+    for line in log_video(options, folder, path, int(path.stem.partition("_")[0])):
         output.say(line)
 
 
-def _attempt(part: Callable[..., Any], *arguments: Any) -> bool:
+def _attempt(what: str, part: Callable[..., Any], *arguments: Any) -> bool:
     """Calls a part of making a video; a failure is one line, and changes no exit code."""
     try:
         part(*arguments)
     except Exception as error:
-        output.warn(f"purerl: There is no video: {one_line(error)}")
+        output.warn(f"purerl: There is no {what}: {one_line(error)}")
         return False
     return True
 

@@ -19,9 +19,10 @@ NAMES = [
     "Array", "Config", "Env", "EnvError", "Evaluation", "Experiment", "Network", "Normal",
     "Physics", "PhysicsState", "Policy", "PolicyOutput", "PyTree", "Run", "RunError", "State",
     "StoppedError", "UserError", "adapters", "check_env", "choose_engine", "exact", "find",
-    "load", "lookup", "networks", "overflow_metric", "overflow_reading", "train",
+    "load", "lookup", "networks", "overflow_metric", "overflow_reading", "planner",
+    "train",
 ]  # fmt: skip
-MODULES = {"adapters", "exact", "lookup", "networks"}
+MODULES = {"adapters", "exact", "lookup", "networks", "planner"}
 # They measure the insides.
 INSIDERS = {"benchmarks", "peers"}
 

@@ -119,11 +119,12 @@ def disable_energy(model: mujoco.MjModel) -> None:
 
 
 def mask_disabled_contacts(model: mujoco.MjModel) -> None:
-    """Masks all geoms of a model whose contacts are disabled.
+    """Masks all geoms of a model whose contacts, or all constraints, are disabled.
 
     It changes nothing, but MJX refuses a pair of shapes that it could not collide, even there.
     """
-    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+    without = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    if model.opt.disableflags & without:
         model.geom_contype[:] = model.geom_conaffinity[:] = 0
 
 
@@ -204,8 +205,13 @@ def draw_apart(
     still = jnp.zeros(geoms.model.nv)
     readings = jax.vmap(lambda q: geoms.init(q, still)[1])(qpos)
     gap = jax.vmap(lambda r: least_gap(geoms.model, pairs, r.geom_xpos, r.geom_xmat))(readings)
+    return qpos[first_apart(gap)]
+
+
+def first_apart(gap: Array) -> Array:
+    """Returns the first index [] at which nothing touches, by least gaps [n] m, or the best one."""
     # `argmax` takes the first of equals: all that touch nothing count as equal.
-    return qpos[jnp.argmax(jnp.minimum(gap, 0.0))]
+    return jnp.argmax(jnp.minimum(gap, 0.0))
 
 
 def touching_pairs(model: mujoco.MjModel) -> np.ndarray:

@@ -1,4 +1,7 @@
-"""Cart-pole: keep the pole up (balance), or swing it up first (swingup). 10 ms a step."""
+"""Cart-pole: keep the pole up (balance), or swing it up first (swingup). 10 ms a step.
+
+The sparse tasks reward only a pole that stands with the cart in the middle.
+"""
 
 from dataclasses import dataclass
 
@@ -11,7 +14,9 @@ from envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, mak
 from envs.suite.rewards import tolerance
 from purerl import Array, lookup
 
-TASKS = ("balance", "swingup")
+TASKS = ("balance", "balance_sparse", "swingup", "swingup_sparse")
+CART_LIMIT = 0.25  # how far from the middle a sparse task still rewards [m]
+UPRIGHT = 0.995  # cosine of the angle within which it does
 READINGS = ("xmat",)
 
 
@@ -19,7 +24,7 @@ READINGS = ("xmat",)
 class Options:
     """Settings of the task."""
 
-    task: str = "swingup"  # "balance" or "swingup"
+    task: str = "swingup"  # one of TASKS
 
 
 @dataclass(frozen=True)
@@ -34,7 +39,7 @@ class Cartpole:
     def start(self, key: Array) -> Start:
         """Hanging, or standing, with a little noise."""
         place_key, speed_key = jax.random.split(key)
-        if self.task == "swingup":
+        if self.task.startswith("swingup"):
             place = jnp.array([0.0, np.pi]) + 0.01 * jax.random.normal(place_key, (2,))
         else:
             limit = jnp.array([0.1, 0.034])
@@ -50,8 +55,11 @@ class Cartpole:
 
     def reward(self, moment: Moment) -> dict[str, Array]:
         """Upright, in the middle, with little force and slowly: the product."""
-        upright = (moment.readings.xmat[self.pole, 2, 2] + 1) / 2
-        centered = (1 + tolerance(moment.physics.qpos[self.slider], margin=2)) / 2
+        cosine, place = moment.readings.xmat[self.pole, 2, 2], moment.physics.qpos[self.slider]
+        upright, centered = (cosine + 1) / 2, (1 + tolerance(place, margin=2)) / 2
+        if self.task.endswith("sparse"):
+            reward = tolerance(place, (-CART_LIMIT, CART_LIMIT)) * tolerance(cosine, (UPRIGHT, 1))
+            return {"reward": reward, "upright": upright, "centered": centered}
         force = tolerance(moment.ctrl[0], margin=1, value_at_margin=0, sigmoid="quadratic")
         slow = (1 + tolerance(moment.physics.qvel[self.hinge], margin=5)) / 2
         reward = upright * (4 + force) / 5 * slow * centered

@@ -2,6 +2,11 @@
 
     nice -n 15 python -m experiments.benchmarks.plan_suite --out plan_suite.csv
     python -m experiments.benchmarks.plan_suite --only hopper-hop --planners cem --steps 200
+    python -m experiments.benchmarks.plan_suite --runs runs/suite/hopper-hop --out beside.csv
+
+Of a run there are rows for its policy alone ("policy"), for planners without it, and for planners
+that correct it ("mppi+policy"), on the same beginnings. What the last ones find beyond the policy,
+it has left on the table.
 
 Ended at any moment, the same command goes on: batches that the file has are not played again. The
 table of means with 95% intervals is printed at the end, and by --table alone.
@@ -13,6 +18,7 @@ import dataclasses
 import itertools
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +31,7 @@ from purerl.plan.settings import Settings
 from purerl.runs.build_experiment import build
 from purerl.runs.command_errors import leave
 from purerl.runs.experiment import Experiment, available, find
+from purerl.runs.loaded_run import load
 
 MUST_SHOW = ("cartpole-swingup", "walker-walk", "cheetah-run", "hopper-hop", "humanoid-stand")
 PLANNERS = ("predictive_sampling", "mppi", "cem")
@@ -39,13 +46,36 @@ def experiment_of(task: str) -> Experiment:
     return dataclasses.replace(find("suite"), env=SuiteOptions(task=task))
 
 
-def play(task: str, settings: Settings, steps: int, seed: int, number: int) -> list[dict]:
-    """Plays a batch of episodes; returns a row for each."""
-    config, env, _, _ = build(experiment_of(task))
+def limit_of(task: str) -> int:
+    """Returns the time limit of a task, or of a run's folder [control steps]."""
+    known = load(task).experiment if Path(task).is_dir() else experiment_of(task)
+    return known.ppo.episode_length
+
+
+def settings_of(name: str) -> Settings:
+    """Returns a planner's settings by its name, with "+policy" or without; "policy": no search.
+
+    The first two samples are the plan, at first 0, and 0: with no more than these nothing changes.
+    """
+    if name == "policy":
+        return Settings(samples=2, elites=2, horizon=1, knots=2)
+    return Settings(planner=name.removesuffix("+policy"))
+
+
+def play(task: str, name: str, steps: int, seed: int, number: int) -> list[dict]:
+    """Plays a batch of episodes of a task, or of a run's folder; returns a row for each."""
+    run = load(task) if Path(task).is_dir() else None
+    config, env, network, _ = run.restored.setup if run else build(experiment_of(task))
     limit = steps or config.episode_length
     config = dataclasses.replace(config, episode_length=limit)
-    guide = planner.unguided(env.action_size)
-    game = episodes.episodes(config, settings, env, lambda _: guide, (), seed, number)
+
+    def guide(learned: Any) -> planner.Guide:
+        if learned is None:
+            return planner.unguided(env.action_size)
+        return planner.guide(config, network, learned)
+
+    learned = run.state if run and name.endswith("policy") else None
+    game = episodes.episodes(config, settings_of(name), env, guide, learned, seed, number)
     times = []
     for playing, _ in game:
         end = playing
@@ -53,7 +83,7 @@ def play(task: str, settings: Settings, steps: int, seed: int, number: int) -> l
     # The first call was compiling.
     rate = (len(times) - 1) * episodes.CHUNK * number / max(times[-1] - times[0], 1e-9)
     found = episodes.results(end)
-    about = {"task": task, "planner": settings.planner, "steps": limit, "seed": seed}
+    about = {"task": task, "planner": name, "steps": limit, "seed": seed}
     return [
         about
         | {
@@ -95,6 +125,7 @@ def main() -> int:
     parser.add_argument("--out", type=output_file, default="plan_suite.csv")
     parser.add_argument("--only", nargs="+", default=default, choices=known, metavar="TASK")
     parser.add_argument("--planners", nargs="+", default=PLANNERS, choices=PLANNERS)
+    parser.add_argument("--runs", nargs="+", default=[], help="runs' folders, instead of tasks")
     parser.add_argument("--batches", type=int, default=5, help="each of a seed of its own")
     parser.add_argument("--side-by-side", type=int, default=2, help="episodes of a batch")
     parser.add_argument("--steps", type=int, default=0, help="0: the experiment's time limit")
@@ -102,13 +133,16 @@ def main() -> int:
     options = parser.parse_args()
     set_up_jax(cache=True)
     file = Path(options.out)
-    games = itertools.product(range(options.batches), options.only, options.planners)
+    names = options.planners
+    if options.runs:
+        names = ["policy", *names, *(f"{name}+policy" for name in names)]
+    games = itertools.product(range(options.batches), options.runs or options.only, names)
     for seed, task, name in () if options.table else games:
-        limit = options.steps or experiment_of(task).ppo.episode_length
+        limit = options.steps or limit_of(task)
         done = [(r["task"], r["planner"], int(r["steps"]), int(r["seed"])) for r in read(file)]
         if (task, name, limit, seed) in done:
             continue
-        rows = play(task, Settings(name), options.steps, seed, options.side_by_side)
+        rows = play(task, name, options.steps, seed, options.side_by_side)
         is_new = not file.exists()
         with file.open("a", newline="") as out:
             writer = csv.DictWriter(out, COLUMNS)

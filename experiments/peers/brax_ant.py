@@ -2,7 +2,7 @@
 
 python -m purerl.run experiments/peers/brax_ant.py
 
-What came of it beside brax itself: `docs/peers.md`.
+What came of it beside brax itself: `docs/measurements/peers.md`.
 """
 
 from experiments.peers.brax_peer import BODIES, our_experiment

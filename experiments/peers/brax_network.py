@@ -2,7 +2,7 @@
 
 `purerl.ppo.networks.mlp` begins near mean 0, with one scale everywhere. brax's policy begins with
 ordinary weights in its last layer, so that it acts otherwise in each state, and with scales around
-0.69: on brax's ant that came to more after 31 M steps (`docs/peers.md`).
+0.69: on brax's ant that came to more after 31 M steps (`docs/measurements/peers.md`).
 """
 
 from dataclasses import dataclass

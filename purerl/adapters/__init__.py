@@ -5,8 +5,9 @@ May import: core, ppo, physics. Read: `stepping.py`, then the file of the librar
   gymnasium_env(env), gymnasium_vector_env(env, number): for `gymnasium`.
   dm_env_environment(env): for `dm_env`.
   from_brax(BraxOptions(name)), from_playground(PlaygroundOptions(name)): their environments for us.
+  from_gymnasium(GymnasiumOptions(name)), from_maker(make): Gymnasium's, stepped through the host.
 
-A name is imported when it is first used: each needs its library. docs/adapters.md shows all.
+A name is imported when it is first used: each needs its library. docs/howto/adapters.md shows all.
 """
 
 import importlib
@@ -16,6 +17,9 @@ HOMES = {
     "gymnasium_env": "to_gymnasium",
     "gymnasium_vector_env": "to_gymnasium",
     "dm_env_environment": "to_dm_env",
+    "GymnasiumOptions": "gymnasium_envs",
+    "from_gymnasium": "gymnasium_envs",
+    "from_maker": "gymnasium_envs",
     "BraxOptions": "brax_envs",
     "from_brax": "brax_envs",
     "PlaygroundOptions": "playground_envs",

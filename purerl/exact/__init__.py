@@ -1,6 +1,6 @@
 """Makes a JAX function bit-exact: the same bits in every run on one kind of device.
 
-It serves anybody with plain MJX: `exact.rewrite(mjx.step)`; see docs/exact.md.
+It serves anybody with plain MJX: `exact.rewrite(mjx.step)`; see docs/howto/exact.md.
 
 What belongs here: code that rewrites a traced function, and the choices of XLA that change bits.
 May import: nothing. Read: `rewriting.py` (the public function), `walk.py` (how a trace is run again

@@ -9,6 +9,8 @@ promises to call for a year at least after it changes. Each begins with its size
 extensions.
 """
 
+import atexit
+import contextlib
 import ctypes
 import functools
 import math
@@ -81,6 +83,14 @@ def register(name: str, function: Callable[[np.ndarray], np.ndarray]) -> None:
         handler = _HANDLER(functools.partial(_answer, function))
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
         _registered[name] = handler
+
+
+@atexit.register
+def _wait() -> None:
+    """Waits for what is still being computed: a call after Python's end would crash the process."""
+    for array in jax.live_arrays() if _registered else ():
+        with contextlib.suppress(Exception):  # its program failed: not ours to tell
+            array.block_until_ready()
 
 
 def call(name: str, width: int, row: Array) -> Array:

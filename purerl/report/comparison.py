@@ -98,9 +98,9 @@ def describe(result: dict[str, Any]) -> list[str]:
     if result["unscored"]:
         return [*lines, f"No scores: {result['unscored']}"]
     groups, versus = result["groups"], result["versus_first"]
-    lines += _table(GROUPS, [g | {"worst_run": Path(g["worst_run"]).name} for g in groups])
+    lines += table(GROUPS, [g | {"worst_run": Path(g["worst_run"]).name} for g in groups])
     if versus:
-        lines += ["", f"against {versus[0]['baseline']}:", *_table(VERSUS, versus)]
+        lines += ["", f"against {versus[0]['baseline']}:", *table(VERSUS, versus)]
         if any(v["same_seeds"] for v in versus):
             lines.append(
                 "Paired: differences between runs of one seed, which begin with the same weights "
@@ -127,7 +127,7 @@ def notes(summaries: Sequence[dict[str, Any]]) -> list[str]:
     return [note for note, holds in found.items() if holds]
 
 
-def _table(columns: Sequence[tuple[str, str]], records: Iterable[dict[str, Any]]) -> list[str]:
+def table(columns: Sequence[tuple[str, str]], records: Iterable[dict[str, Any]]) -> list[str]:
     """Returns a table's lines, its head first; the first column is flush left, others right."""
     rows = [[head for head, _ in columns]]
     rows += [[cell(record[key]) for _, key in columns] for record in records]
@@ -162,8 +162,8 @@ def write(folder: Path, result: dict[str, Any], curves: Sequence[Curve]) -> None
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "compare.json", result)
-        _write_csv(folder / "groups.csv", GROUPS_CSV, groups)
-        _write_csv(folder / "curves.csv", CURVES_CSV, _curve_rows(curves))
+        write_csv(folder / "groups.csv", GROUPS_CSV, groups)
+        write_csv(folder / "curves.csv", CURVES_CSV, _curve_rows(curves))
         if curves:
             draw_curves(folder / "curves.png", curves, result["metric"])
     except OSError as error:
@@ -177,7 +177,7 @@ def _curve_rows(curves: Iterable[Curve]) -> Iterator[dict[str, Any]]:
             yield {"group": curve.label, "n": len(curve.runs), "steps": steps} | band
 
 
-def _write_csv(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> None:
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> None:
     """Writes rows; what is None or missing is an empty cell."""
     with path.open("w", newline="", errors="backslashreplace") as file:
         writer = csv.DictWriter(file, columns, extrasaction="ignore")

@@ -1,6 +1,7 @@
 """Checks that an environment keeps to the protocol of `purerl.core.env`."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,11 +28,32 @@ def check_env(env: Env, num_envs: int = 4, num_steps: int = 4) -> None:
       EnvError: names the field that broke a rule, and the rule.
     """
     check_shapes(env)
+    trial = try_out(env, num_envs, num_steps)
+    check_keys_repeat(trial)
+    check_differs(trial.start)
+    check_finite("reset", trial.start)
+    check_finite("step", trial.states)
+    check_steps_repeat(trial)
+    ended = trial.last.replace(terminated=jnp.ones(num_envs, bool))
+    check_finite("a step after termination", trial.rollout(ended, trial.actions)[1])
+
+
+class Trial(NamedTuple):
+    """What B environments did in T steps."""
+
+    start: State  # [B, ...]
+    restart: State  # [B, ...] of the same keys
+    actions: Array  # [T, B, A]
+    last: State  # [B, ...]
+    states: State  # [T, B, ...] after each step
+    rollout: Callable[[State, Array], tuple[State, State]]  # compiled: start, actions -> the two
+
+
+def try_out(env: Env, num_envs: int, num_steps: int) -> Trial:
+    """Resets and steps `num_envs` environments, with actions -1, 0, 1 and `num_steps` random."""
     keys = jax.random.split(jax.random.key(0), num_envs)
     reset = jax.jit(jax.vmap(env.reset))
-    state = reset(_again(keys))
-    _check_bits("equal keys", state, reset(keys), "reset must be a function of its key alone")
-    _check_differs(state)
+    start, restart = reset(_again(keys)), reset(keys)
     shape = (num_envs, env.action_size)
     corners = [jnp.full((1, *shape), number) for number in (-1.0, 0.0, 1.0)]
     noise = jax.random.uniform(jax.random.key(1), (num_steps, *shape), minval=-1.0, maxval=1.0)
@@ -42,13 +64,21 @@ def check_env(env: Env, num_envs: int = 4, num_steps: int = 4) -> None:
         step = jax.vmap(env.step)
         return jax.lax.scan(lambda s, action: (step(s, action),) * 2, state, actions)
 
-    last, states = rollout(_again(state), actions)
-    _check_finite("reset", state)
-    _check_finite("step", states)
-    again = rollout(state, actions)[1]
-    _check_bits("equal states and actions", states, again, "step must be a function of both alone")
-    ended = last.replace(terminated=jnp.ones(num_envs, bool))
-    _check_finite("a step after termination", rollout(ended, actions)[1])
+    last, states = rollout(_again(start), actions)
+    return Trial(start, restart, actions, last, states, rollout)
+
+
+def check_keys_repeat(trial: Trial) -> None:
+    """Checks that reset does the same twice."""
+    rule = "reset must be a function of its key alone"
+    _check_bits("equal keys", trial.start, trial.restart, rule)
+
+
+def check_steps_repeat(trial: Trial) -> None:
+    """Checks that step does the same twice."""
+    again = trial.rollout(_again(trial.start), trial.actions)[1]
+    rule = "step must be a function of both alone"
+    _check_bits("equal states and actions", trial.states, again, rule)
 
 
 def check_shapes(env: Env) -> None:
@@ -172,7 +202,8 @@ def _again(tree: PyTree) -> PyTree:
     return jax.tree.map(lambda x: jax.random.clone(x) if is_key(x) else x, tree)
 
 
-def _check_finite(when: str, state: PyTree) -> None:
+def check_finite(when: str, state: PyTree) -> None:
+    """Checks that every number is finite, and none absurd."""
     for name, value in flatten(state).items():
         # A NaN fails the comparison.
         if np.issubdtype(value.dtype, np.floating) and not (np.abs(value) <= ABSURD).all():
@@ -188,7 +219,7 @@ def lost_part(state: PyTree) -> str:
     if jax.process_count() > 1:  # each has a part of them only
         return ""
     try:
-        _check_finite("reset", state)
+        check_finite("reset", state)
     except EnvError as error:
         return str(error)
     return ""
@@ -201,7 +232,7 @@ def _check_bits(what: str, first: PyTree, second: PyTree, rule: str) -> None:
             raise EnvError(f"{name} differs between two calls with {what}: {rule}.")
 
 
-def _check_differs(state: State) -> None:
+def check_differs(state: State) -> None:
     """Different keys must give different starts, or B environments are one."""
     leaves = flatten((state.physics, state.observation, state.task)).values()
     if not any((leaf[0] != leaf[1]).any() for leaf in leaves):

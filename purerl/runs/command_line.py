@@ -140,14 +140,21 @@ def _one_line(text: str, names: list[str]) -> str:
     return plain.rstrip(".") + "." if plain else "The command line is wrong."
 
 
+def _wrong_choice(found: re.Match[str]) -> str:
+    value, option, choices = found.groups()
+    near = nearest(value.strip("'"), re.findall(r"'([^']*)'", choices))
+    hint = f"did you mean {near!r}? It" if near else "it"
+    return f"{option} is {value}; {hint} must be one of {choices}"
+
+
 # Python's words and tyro's, and ours.
-_IN_WORDS = (
+_IN_WORDS: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (
         r"^Error parsing (\S+): invalid literal .*?: (.*)",
         r"\1 is \2; it must be a whole number",
     ),
     (r"^Error parsing (\S+): could not convert .*?: (.*)", r"\1 is \2; it must be a number"),
-    (r"^invalid choice (.*) for argument '(\S+)'.*\((.*)\)", r"\2 is \1; it must be one of \3"),
+    (r"^invalid choice (.*) for argument '(\S+)'.*\((.*)\)", _wrong_choice),
     (r"^Missing from .*?: [A-Z.,\[\]{} ]+?(?=[A-Z][a-z'])", "The command lacks: "),
     (r" \(required\)", ""),
     (r"^Error parsing \w+: ", ""),  # a rule of a dataclass, in its own words

@@ -20,7 +20,7 @@ def load(
     """Reads a run back from its folder alone; nothing in it is changed.
 
     The run's experiment.py is executed when something but `metrics()` is first asked for: if it is
-    known on this machine, as of a run trained here, or with `trust` (docs/trust.md).
+    known on this machine, as of a run trained here, or with `trust` (docs/reference/trust.md).
 
     Args:
       folder: the run's folder, such as "runs/ant_run/seed1".

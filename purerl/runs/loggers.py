@@ -111,10 +111,11 @@ class _TensorBoardSink:
                 self.writer.add_scalar(name, value, record["update"])
 
 
-class _WandbSink:
+class WandbSink:
     """Sends records to Weights & Biases; a resumed run goes on under the same id."""
 
     def __init__(self, folder: Path, mode: Any, project: str) -> None:
+        """Begins a W&B run, or goes on with it: `mode` is online or offline."""
         import wandb
 
         self.run = wandb.init(
@@ -153,5 +154,5 @@ def open_loggers(options: Options, folder: Path, update: int, say: Say) -> list[
         found.append(BackgroundLogger("TensorBoard", lambda: _TensorBoardSink(folder, update), say))
     if options.wandb != "off":
         mode, project = options.wandb, options.wandb_project
-        found.append(BackgroundLogger("W&B", lambda: _WandbSink(folder, mode, project), say))
+        found.append(BackgroundLogger("W&B", lambda: WandbSink(folder, mode, project), say))
     return found

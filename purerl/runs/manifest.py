@@ -43,7 +43,11 @@ def read(folder: Path) -> dict[str, Any]:
 
 
 def collect(
-    engine: str, builders: Iterable[Callable], kernels: str = "fixed", num_shards: int = 1
+    engine: str,
+    builders: Iterable[Callable],
+    kernels: str = "fixed",
+    num_shards: int = 1,
+    inexact: str = "",
 ) -> dict[str, Any]:
     """Describes this process: all that decides a run's bits apart from the run's own settings.
 
@@ -52,6 +56,7 @@ def collect(
       builders: functions whose source is part of the run (build_env, build_network).
       kernels: `exact.how_chosen`.
       num_shards: V. How many devices share the shards changes no bit.
+      inexact: why the environment itself prevents equal bits; "": it does not.
     """
     import jax
 
@@ -77,20 +82,20 @@ def collect(
             "flags": _flags(),
             "source": source_hashes(builders),
         }
-        | exactness(engine, kernels)
+        | exactness(engine, kernels, inexact)
         | _git(Path(__file__).parent)
     )
 
 
-def exactness(engine: str, kernels: str, unordered: Iterable[str] = ()) -> dict[str, Any]:
+def exactness(engine: str, kernels: str, inexact: str = "") -> dict[str, Any]:
     """Returns what manifest.json says of a run's exactness, and of what prevents it.
 
     Args:
       engine: the physics engine.
       kernels: `exact.how_chosen`.
-      unordered: places of sums, in a program for a GPU, whose order nothing fixes.
+      inexact: why the environment itself prevents it, or "": its member `inexact`.
     """
-    reasons = [f"a sum without a fixed order: {place}" for place in unordered]
+    reasons = [inexact] if inexact else []
     if engine == "warp":
         reasons.append("engine warp: MJX-Warp adds with atomics, in any order")
     if kernels == "by timing":
@@ -98,6 +103,13 @@ def exactness(engine: str, kernels: str, unordered: Iterable[str] = ()) -> dict[
             "XLA chooses kernels by timing, anew in each process: leave xla_gpu_autotune_level out "
             "of XLA_FLAGS, or set it to 0"
         )
+    return {"bit_exact": not reasons, "inexact_because": reasons}
+
+
+def with_unordered(facts: dict[str, Any], places: Iterable[str]) -> dict[str, Any]:
+    """Returns the same once a program for a GPU has shown the sums whose order nothing fixes."""
+    reasons = [f"a sum without a fixed order: {place}" for place in places]
+    reasons += facts["inexact_because"]
     return {"bit_exact": not reasons, "inexact_because": reasons}
 
 

@@ -40,6 +40,7 @@ from purerl.runs import (
 )
 from purerl.runs.build_experiment import Setup
 from purerl.runs.command_errors import tell
+from purerl.runs.examine_env import tell_first
 from purerl.runs.experiment import Experiment, Source
 from purerl.runs.files import read_json, write_json
 from purerl.runs.lock import RunLock
@@ -120,7 +121,7 @@ def execute(
                     calls_host=setup.engine == "c",
                 )  # fmt: skip
             if jax.default_backend() == "gpu" and processes.is_first():
-                exactness = manifest.exactness(setup.engine, facts["kernels"], made.unordered)
+                exactness = manifest.with_unordered(facts, made.unordered)
                 _tell_unordered(runs, exactness, made.unordered)
             return made
 
@@ -133,7 +134,8 @@ def _facts(
     """Returns what manifest.json says of a run that begins now."""
     builders = (chosen.build_env, chosen.build_network)
     kernels = exact.how_chosen(jax.default_backend())
-    facts = manifest.collect(setup.engine, builders, kernels, shards.number)
+    inexact = getattr(setup.env, "inexact", "")
+    facts = manifest.collect(setup.engine, builders, kernels, shards.number, inexact)
     facts["model"] = build_experiment.physics_hash(setup.env)
     facts["experiment_file"] = str(source.path)
     if options.vmapped_seeds > 1:
@@ -215,8 +217,9 @@ def _train_together(job: _Job, folders: list[Path], seeds: list[int]) -> None:
             owners = list(map(identity.owners, facts))
             saved.extend(checkpoint.newest(places, job.abstract, say, owners=owners))
             if not saved:
-                promised = any(one.get("had_checkpoint") for one in facts)
-                checkpoint_folder.check_none_lost(places, promised)
+                checkpoint_folder.check_none_lost(
+                    places, any(f.get("had_checkpoint") for f in facts)
+                )
                 if job.options.resume:
                     say(f"There is no checkpoint in {places[0]}: it begins anew.")
             known = saved[0].meta if saved else {"wall_s": 0.0, "update": 0}
@@ -233,7 +236,8 @@ def _train_together(job: _Job, folders: list[Path], seeds: list[int]) -> None:
         say(f"Compiled: {times}")
         for one in saved:
             say(f"Resuming after update {one.meta['update']}. Digest {one.meta['digest']}")
-        state = _first_state(found, saved, seeds, programs, job.abstract)
+        state = _first_state(found, saved, seeds, job)
+        tell_first(None if found else state.env, say)
         writers: list[Any] = [processes.Silent(folder) for folder in folders]
         if processes.is_first():
             with run_folder.refusals():
@@ -250,11 +254,7 @@ def _train_together(job: _Job, folders: list[Path], seeds: list[int]) -> None:
 
 
 def _first_state(
-    found: bool,
-    saved: list[checkpoint.Saved],
-    seeds: list[int],
-    programs: Programs,
-    abstract: PyTree,
+    found: bool, saved: list[checkpoint.Saved], seeds: list[int], job: _Job
 ) -> TrainState:
     """Returns the state to begin with: new, or the `saved` one that the first process has found."""
 
@@ -262,9 +262,9 @@ def _first_state(
         return trees[0] if len(trees) == 1 else jax.tree.map(lambda *x: jnp.stack(x), *trees)
 
     if not found:
-        return programs.init(together([jax.random.key(seed) for seed in seeds]))
+        return job.programs().init(together([jax.random.key(seed) for seed in seeds]))
     state = together([one.state for one in saved]) if saved else None
-    return processes.state_of_first(state, abstract)
+    return processes.state_of_first(state, job.abstract)
 
 
 def _open_writers(

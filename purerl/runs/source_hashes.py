@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 PACKAGE = Path(__file__).parent.parent
-AFTERWARDS = {"plan", "report", "view"}  # rooms that only look at what a run has written
+# Rooms that only start runs, or look at what one has written.
+AFTERWARDS = {"plan", "report", "sweep", "view"}
 
 
 def source_hashes(builders: Iterable[Callable], package: Path = PACKAGE) -> dict[str, str]:

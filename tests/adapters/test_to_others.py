@@ -209,7 +209,7 @@ def test_it_is_drawn():
 
 # --- the page ---
 
-PYTHON = blocks(PAGES["docs/adapters.md"].read_text(), "python")
+PYTHON = blocks(PAGES["docs/howto/adapters.md"].read_text(), "python")
 
 
 @pytest.mark.parametrize("library", ["gymnasium_env", "dm_env_environment"])

@@ -12,6 +12,7 @@ from dm_control.utils import rewards
 
 from envs.suite import base, hopper, tasks
 from envs.suite.rewards import SIGMOIDS, tolerance
+from purerl import run
 from purerl.runs.check_env import check_env
 from tests import quick
 
@@ -54,18 +55,32 @@ def random_states(env, rng):
 def towards_success(env, qpos, changes, rng):
     """Makes a state likely to be rewarded, which a random one seldom is; changes `changes`."""
     model, data = env.physics.model, mujoco.MjData(env.physics.model)
-    if changes:  # the target comes to the part that should reach it
-        part = env.domain.finger if hasattr(env.domain, "finger") else env.domain.nose
+    if changes:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
-        place = data.geom_xpos[part, :2] + rng.normal(size=2) * 0.02
-        changes["geom_pos"][env.domain.target, :2] = place
+        bring_target(env.domain, data, changes, rng)
         return qpos
-    if hasattr(env.domain, "ball"):  # into the cup: the ball hangs from 20 cm, the cup from 60
+    if hasattr(env.domain, "free"):  # into the cup: the ball hangs from 20 cm, the cup from 60
         qpos = np.zeros(4)
         qpos[list(env.domain.free)] = [0.0, 0.35] + rng.normal(size=2) * 0.02
         return qpos
-    return model.qpos0 + 0.15 * rng.normal(size=model.nq)
+    far = 0.015 if hasattr(env.domain, "mass") else 0.15  # the point mass has a target of 15 mm
+    return model.qpos0 + far * rng.normal(size=model.nq)
+
+
+def bring_target(domain, data, changes, rng):
+    """Brings the target to the part that should reach it, or nearly so."""
+    name, noise = next(iter(changes)), 0.02 * rng.normal(size=3)
+    if name == "geom_pos":
+        (part,) = (getattr(domain, p) for p in ("finger", "nose", "mouth") if hasattr(domain, p))
+        axes = 3 if hasattr(domain, "mouth") else 2
+        changes[name][domain.target, :axes] = (data.geom_xpos[part] + noise)[:axes]
+    elif name == "site_pos":
+        place = data.site("tip").xpos + 2 * noise
+        changes[name][domain.target_site, [0, 2]] = place[[0, 2]]
+    else:
+        place = data.body("ball").xpos + noise
+        changes[name][domain.bodies[2], [0, 2]] = place[[0, 2]]
 
 
 def observer(env):
@@ -140,6 +155,7 @@ def test_steps_are_dm_controls(pair):
         "reacher-easy",
         "acrobot-swingup",
         "ball_in_cup-catch",
+        "fish-swim",
     ],
 )
 def test_engines_agree(name):
@@ -155,6 +171,36 @@ def test_engines_agree(name):
     ]
     np.testing.assert_allclose(last[1][0].observation, last[0][0].observation, atol=1e-4)
     np.testing.assert_allclose(last[1][1], last[0][1], atol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "cartpole-swingup_sparse",
+        "finger-turn_hard",
+        "fish-swim",
+        "manipulator-bring_ball",
+        "point_mass-easy",
+        "swimmer-swimmer15",
+    ],
+)
+def test_starts_are_distributed_as_dm_controls(name):
+    """What is observed at 1000 starts of each, number by number: one distribution."""
+    state = quick.jit(jax.vmap(ours(name).reset))(jax.random.split(jax.random.key(0), 1000))
+    dm = suite.load(*name.split("-"), task_kwargs={"random": 0})
+    theirs = np.array([flat(dm.reset().observation) for _ in range(1000)])
+    distance = [ks_distance(*pair) for pair in zip(state.observation.T, theirs.T, strict=True)]
+    # Two samples of one distribution are so far apart once in a million.
+    assert max(distance) < np.sqrt(np.log(2e6) / 1000)
+
+
+def ks_distance(a, b):
+    """Greatest difference between the distributions of two samples (Kolmogorov and Smirnov)."""
+    a, b = np.round(np.float64(a), 5), np.round(b, 5)
+    at = np.concatenate([a, b])
+    below = [np.searchsorted(np.sort(x), at, side="right") / len(x) for x in (a, b)]
+    return np.abs(below[0] - below[1]).max()
 
 
 @pytest.mark.slow
@@ -197,13 +243,30 @@ def test_tolerance_refuses(kwargs):
 
 
 def test_an_unknown_task_is_named():
+    with pytest.raises(ValueError, match="'fish_swim'. Did you mean 'fish-swim'.*fish-upright"):
+        ours("fish_swim")
     with pytest.raises(ValueError, match="'hopper-walk'. Did you mean 'hopper-stand'.*walker-walk"):
         ours("hopper-walk")
     with pytest.raises(ValueError, match="stand, hop"):
         hopper.build(hopper.Options("walk"))
 
 
-@pytest.mark.parametrize("name", ["humanoid-stand", "ball_in_cup-catch", "finger-spin"])
+def test_the_command_names_the_nearest_task(capsys):
+    assert run.main(["suite", "--env.task", "fish-swm"]) == 2
+    said = capsys.readouterr().err
+    assert "did you mean 'fish-swim'? It must be one of 'acrobot-swingup'," in said
+    assert len(said.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "humanoid-stand",
+        "ball_in_cup-catch",
+        "finger-spin",
+        pytest.param("manipulator-bring_ball", marks=pytest.mark.slow),
+    ],
+)
 def test_starts_touch_nothing(name):
     """In nearly all starts; and the draw sees what MuJoCo sees."""
     env = ours(name)

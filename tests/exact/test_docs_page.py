@@ -1,4 +1,4 @@
-"""The page `docs/exact.md` runs as it stands, and prints what it says."""
+"""The page `docs/howto/exact.md` runs as it stands, and prints what it says."""
 
 import os
 import re
@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def blocks(kind):
-    return re.findall(rf"```{kind}\n(.*?)```", (ROOT / "docs" / "exact.md").read_text(), re.S)
+    return re.findall(rf"```{kind}\n(.*?)```", (ROOT / "docs/howto/exact.md").read_text(), re.S)
 
 
 @pytest.mark.slow
@@ -30,6 +30,6 @@ def test_the_pages_code_prints_what_the_page_says():
 def test_the_page_names_the_flags_that_are_set():
     from purerl.exact import xla_flags
 
-    page = (ROOT / "docs" / "exact.md").read_text()
+    page = (ROOT / "docs/howto/exact.md").read_text()
     for name, value in (xla_flags.RULES | xla_flags.GRAPHS).items():
         assert f"--{name}={value}" in page

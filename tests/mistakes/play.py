@@ -159,7 +159,7 @@ another is given. This page is written by `python -m tests.mistakes --write`, fr
 
 
 def page() -> str:
-    """Returns docs/mistakes.md."""
+    """Returns docs/reference/mistakes.md."""
     parts, mistakes = [HEAD], read_table()
     for where in dict.fromkeys(mistake.where for mistake in mistakes):
         parts.append(f"## {where}\n")

@@ -75,5 +75,5 @@ def test_there_are_many_and_no_two_alike():
 
 
 def test_the_page_quotes_the_table():
-    written = (ROOT / "docs" / "mistakes.md").read_text()
+    written = (ROOT / "docs/reference/mistakes.md").read_text()
     assert written == page(), "python -m tests.mistakes --write"

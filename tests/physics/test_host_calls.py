@@ -167,3 +167,22 @@ def test_another_process_finds_the_program_compiled(tmp_path):
     first, second, third = start(path), start(path), start(other)
     assert (first[1], second[1], third[1]) == (0, 1, 0)
     assert first[0] == second[0] != third[0]
+
+
+LEAVE = """
+import jax, jax.numpy as jnp
+from envs import cartpole_swingup
+env = cartpole_swingup.build(cartpole_swingup.Options(), "c")
+state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 64))
+@jax.jit
+def swing(state):
+    step = jax.vmap(lambda s: env.step(s, jnp.zeros(1)))
+    return jax.lax.scan(lambda s, _: (step(s), None), state, None, length=2000)[0]
+state = swing(state)
+"""
+
+
+@pytest.mark.slow
+def test_a_process_that_leaves_in_the_middle_of_a_computation_ends_well():
+    """A call after Python's end has nobody to answer it: the process crashed, or hung."""
+    subprocess.run([sys.executable, "-c", LEAVE], check=True, timeout=120)

@@ -23,7 +23,7 @@ from tests.test_readme import PAGES, blocks
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parent.parent.parent
-PYTHON = blocks(PAGES["docs/export.md"].read_text(), "python")
+PYTHON = blocks(PAGES["docs/howto/export.md"].read_text(), "python")
 SLOW = pytest.mark.slow
 FEW = {"ppo.num_steps": 256, "network.value_hidden": (8,), "evaluation.number": 0}
 OWN = {"ppo.num_steps": 512, "ppo.num_envs": 4, "ppo.rollout_length": 16, "ppo.episode_length": 20}

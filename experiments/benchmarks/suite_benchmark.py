@@ -1,0 +1,108 @@
+"""Trains control suite tasks by seeds, and scores them beside what others published.
+
+    python -m experiments.benchmarks.suite_benchmark                       # every task: hours
+    python -m experiments.benchmarks.suite_benchmark cheetah-run hopper-hop --steps 3000000
+    python -m experiments.benchmarks.suite_benchmark --scores results/suite/seeds.csv  # no training
+
+Other words are settings, as `python -m purerl.run suite --help` lists them. All seeds of a task
+are vmapped in one process, as many processes at once as the machine takes. The same command goes on
+with what was stopped; a seed that fails is counted as failed. It is a sweep over `env.task`, and
+its folder is one of `python -m purerl.sweep`.
+"""
+
+import argparse
+import csv
+import itertools
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from envs.suite.tasks import TASKS
+from experiments.benchmarks import suite_pictures, suite_scores
+from purerl.core.errors import INTERRUPTED, SUCCESS, USAGE, UserError, unknown_name
+from purerl.report.run_reader import read
+from purerl.runs.command_errors import leave
+from purerl.runs.files import runs_in
+from purerl.sweep.__main__ import main as sweep
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code, which is that of the sweep."""
+    parser = argparse.ArgumentParser(
+        prog="python -m experiments.benchmarks.suite_benchmark",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("tasks", nargs="*", help="which tasks; all by default")
+    parser.add_argument("--steps", type=int, default=10_000_000, help="control steps of each run")
+    parser.add_argument("--seeds", type=int, default=5, help="seeds of each task")
+    parser.add_argument("--first-seed", type=int, default=10, help="others than those chosen on")
+    parser.add_argument("--jobs", type=int, default=0, help="processes at once; 0: by the machine")
+    parser.add_argument("--name", default="suite", help="of the sweep, a folder in sweeps/")
+    parser.add_argument("--out", type=Path, help="folder for tables and pictures; the sweep's own")
+    parser.add_argument("--scores", type=Path, help="draw this seeds.csv again, and train nothing")
+    options, settings = parser.parse_known_args(arguments)
+    if options.scores is not None:
+        report(suite_scores.read_seeds(options.scores), options.out or options.scores.parent)
+        return SUCCESS
+    for task in options.tasks:
+        if task not in TASKS:
+            raise UserError(unknown_name("task", task, TASKS))
+    folder = Path("sweeps") / options.name
+    code = sweep([*words(options, settings)])
+    if code != USAGE:
+        found = [read(run) for run in runs_in(folder / "suite")] if folder.is_dir() else []
+        seeds = [suite_scores.seed_of(run) for run in found]
+        if code != INTERRUPTED:
+            seeds += never_begun(options, seeds)
+        report(seeds, options.out or folder)
+    return code
+
+
+def never_begun(
+    options: argparse.Namespace, seeds: Iterable[suite_scores.Seed]
+) -> list[suite_scores.Seed]:
+    """Returns the seeds that failed before they had a folder: they count, too."""
+    known = {(s.task, s.seed) for s in seeds}
+    numbers = range(options.first_seed, options.first_seed + options.seeds)
+    every = itertools.product(options.tasks or TASKS, numbers)
+    return [suite_scores.Seed(*one, "failed", (), (), ()) for one in every if one not in known]
+
+
+def words(options: argparse.Namespace, settings: Sequence[str]) -> list[str]:
+    """Returns the sweep's command line: a point for each task, a run for each seed."""
+    return [
+        "suite",
+        *("--grid", f"env.task={','.join(options.tasks or TASKS)}"),
+        *("--seeds", str(options.seeds), "--seed", str(options.first_seed)),
+        *("--ppo.num-steps", str(options.steps), "--evaluation.number", "20"),
+        *("--jobs", str(options.jobs), "--name", options.name),
+        *settings,
+    ]
+
+
+def report(seeds: Sequence[suite_scores.Seed], out: Path) -> None:
+    """Writes seeds.csv, tasks.csv and the pictures, and prints what is ahead of whom."""
+    tasks, published = suite_scores.by_task(seeds), suite_scores.references()
+    if not tasks:
+        print("No seed has come to its end yet.")
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    suite_scores.write_seeds(out / "seeds.csv", seeds)
+    rows = suite_scores.table(tasks, published)
+    with (out / "tasks.csv").open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
+    for row in rows:
+        print(" ".join([f"{row[0]:24}", *(f"{cell!s:>12}" for cell in row[1:])]))
+    print(suite_pictures.summary(tasks))
+    for column in suite_scores.SHOWN:
+        above, below = suite_scores.ahead(tasks, published, column)
+        short = f"; short: {', '.join(below)}" if below else ""
+        print(f"at or above {column}: {len(above)} of {len(above) + len(below)}{short}")
+    for across in ("steps", "seconds"):
+        suite_pictures.draw_tasks(out / f"tasks_over_{across}.png", tasks, published, across)
+    suite_pictures.draw_together(out / "together.png", tasks)
+    print(*(str(path) for path in sorted(out.glob("t*.png"))), sep="\n")
+
+
+if __name__ == "__main__":
+    leave(main)

@@ -1,0 +1,117 @@
+"""Pictures of the control suite's scores: each task's curves, and all tasks together."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.benchmarks.suite_scores import (
+    BEST,
+    LEVELS,
+    Seed,
+    common_curve,
+    profile,
+    strata,
+)
+from purerl.report import bootstrap
+
+LINES = {"brax_ppo_end": ("brax PPO", "C1"), "reppo_end": ("REPPO, 200 M", "C2")}
+COLUMNS = 5
+
+
+def draw_tasks(
+    path: Path, tasks: dict[str, list[Seed]], published: dict[str, dict[str, float]], across: str
+) -> None:
+    """Writes a picture with a panel for each task: IQM, interval, seeds, published returns.
+
+    Args:
+      path: of the PNG.
+      tasks: `by_task`.
+      published: `references`.
+      across: "steps" or "seconds".
+    """
+    pyplot = _pyplot()
+    columns = min(COLUMNS, len(tasks))
+    rows = math.ceil(len(tasks) / columns)
+    figure, panels = pyplot.subplots(
+        rows, columns, figsize=(3 * columns, 2.2 * rows), sharey=True, squeeze=False,
+        layout="constrained",
+    )  # fmt: skip
+    for panel in panels.flat[len(tasks) :]:
+        panel.set_axis_off()
+    for panel, (task, seeds) in zip(panels.flat, tasks.items(), strict=False):
+        _draw_task(panel, seeds, published.get(task, {}), across)
+        panel.set_title(f"{task} (n = {len(seeds)})", fontsize="small")
+    panels.flat[0].legend(fontsize="x-small")
+    figure.supxlabel("control steps" if across == "steps" else "seconds")
+    figure.supylabel("return; IQM, 95% interval")
+    figure.savefig(path, dpi=100)
+    pyplot.close(figure)
+
+
+def _draw_task(panel: Any, seeds: Sequence[Seed], published: dict[str, float], across: str) -> None:
+    for s in seeds:
+        panel.plot(getattr(s, across), s.returns, color="C0", linewidth=0.5, alpha=0.4)
+    found = common_curve(seeds)
+    if found is not None:
+        steps, (iqm, low, high), seconds = found
+        x = steps if across == "steps" else seconds
+        panel.plot(x, iqm, color="C0", linewidth=2, label="purerl")
+        if low is not None:
+            panel.fill_between(x, low, high, color="C0", alpha=0.2, linewidth=0)
+    for column, (label, color) in LINES.items():
+        if column in published:
+            panel.axhline(published[column], color=color, linewidth=1, linestyle="--", label=label)
+    panel.set_ylim(0, BEST * 1.03)
+    panel.grid(alpha=0.3)
+
+
+def draw_together(path: Path, tasks: dict[str, list[Seed]]) -> None:
+    """Writes a picture of all tasks: IQM over steps, and the performance profile at the end."""
+    pyplot = _pyplot()
+    figure, (left, right) = pyplot.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
+    steps, band = together(tasks)
+    left.plot(steps, band.iqm, color="C0", linewidth=2)
+    if band.low is not None:
+        left.fill_between(steps, band.low, band.high, color="C0", alpha=0.2, linewidth=0)
+    left.set(xlabel="control steps", ylabel="return", title=f"IQM of {len(tasks)} tasks")
+    share, low, high = profile(tasks)
+    right.plot(LEVELS, share, color="C0", linewidth=2)
+    right.fill_between(LEVELS, low, high, color="C0", alpha=0.2, linewidth=0)
+    right.set(xlabel="return", ylabel="share of runs above", title="performance profile")
+    for panel in (left, right):
+        panel.grid(alpha=0.3)
+    figure.savefig(path, dpi=100)
+    pyplot.close(figure)
+
+
+def together(tasks: dict[str, list[Seed]]) -> tuple[list[int], bootstrap.Band]:
+    """Returns the steps at which all seeds of all tasks were evaluated, and the IQM there."""
+    everyone = [s for seeds in tasks.values() for s in seeds]
+    steps = sorted(set.intersection(*(set(s.steps) for s in everyone)))
+    values = [
+        np.array([[s.returns[s.steps.index(n)] for n in steps] for s in seeds])
+        for seeds in tasks.values()
+    ]
+    return steps, bootstrap.curve_band(values, number=500)
+
+
+def summary(tasks: dict[str, list[Seed]]) -> str:
+    """Returns one line: the IQM of all tasks' seeds, with its interval."""
+    scores = strata(tasks)
+    interval = bootstrap.iqm_interval(scores)
+    of = f" ({interval.low:.1f} to {interval.high:.1f})" if interval else ""
+    number = sum(map(len, scores))
+    return f"IQM of {len(tasks)} tasks, {number} runs: {bootstrap.pooled_iqm(scores):.1f}{of}"
+
+
+def _pyplot() -> Any:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    pyplot.style.use("tableau-colorblind10")
+    return pyplot

@@ -1,0 +1,172 @@
+"""What runs on the control suite scored: a row for each seed, a table of tasks, pictures.
+
+`suite_reference.csv` beside this file has what others published: interquartile means of 1000 on
+MuJoCo Playground's version of each task, computed from the per-seed curves that REPPO's authors
+published (February 2026), and TD-MPC2's published means after 4 M steps on dm_control's own. brax's
+PPO trained for 79 to 184 M steps, SAC for 5 to 26 M, REPPO for 200 M.
+"""
+
+import csv
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from purerl.report import bootstrap
+from purerl.report.run_reader import RunRecord
+
+METRIC = "eval/episode_return"
+BEST = 1000.0  # the greatest return of an episode of 1000 steps
+REFERENCES = Path(__file__).parent / "suite_reference.csv"
+SHOWN = ("brax_ppo_10M", "brax_ppo_end", "reppo_end", "tdmpc2_4M")  # columns of the table
+LEVELS = np.linspace(0.0, BEST, 101)
+
+
+class Seed(NamedTuple):
+    """One seed of one task."""
+
+    task: str
+    seed: int
+    status: str  # "done", "failed" or "unfinished"
+    steps: tuple[int, ...]  # of each evaluation
+    returns: tuple[float, ...]  # of each evaluation
+    seconds: tuple[float, ...]  # since the run began, at each evaluation
+
+    @property
+    def score(self) -> float:
+        """The last return. A run that failed before its first evaluation has learned nothing: 0."""
+        return self.returns[-1] if self.returns else 0.0
+
+
+def seed_of(run: RunRecord) -> Seed:
+    """Returns what a run on a task scored."""
+    lines = [line for line in run.lines if line.get(METRIC) is not None]
+    return Seed(
+        task=run.settings["env.task"],
+        seed=run.seed,
+        status=run.status,
+        steps=tuple(line["steps"] for line in lines),
+        returns=tuple(float(line[METRIC]) for line in lines),
+        seconds=tuple(float(line.get("wall_s") or 0.0) for line in lines),
+    )
+
+
+# --- files ---
+
+
+def write_seeds(path: Path, seeds: Iterable[Seed]) -> None:
+    """Writes a row for each evaluation of each seed; a seed without one has a row too."""
+    with path.open("w", newline="") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(["task", "seed", "status", "steps", "return", "seconds"])
+        for s in seeds:
+            points = list(zip(s.steps, s.returns, s.seconds, strict=True)) or [("", "", "")]
+            for steps, value, seconds in points:
+                known = [f"{value:.2f}", f"{seconds:.1f}"] if steps != "" else ["", ""]
+                rows.writerow([s.task, s.seed, s.status, steps, *known])
+
+
+def read_seeds(path: Path) -> list[Seed]:
+    """Reads what `write_seeds` wrote: the table and the pictures can be made of the file alone."""
+    found: dict[tuple[str, int, str], list[tuple[int, float, float]]] = {}
+    with path.open(newline="") as file:
+        for row in csv.DictReader(file):
+            points = found.setdefault((row["task"], int(row["seed"]), row["status"]), [])
+            if row["steps"]:
+                points.append((int(row["steps"]), float(row["return"]), float(row["seconds"])))
+    return [
+        Seed(*name, *(tuple(column) for column in zip(*points, strict=True)))  # type: ignore[arg-type]
+        if points
+        else Seed(*name, (), (), ())
+        for name, points in found.items()
+    ]
+
+
+def references(path: Path = REFERENCES) -> dict[str, dict[str, float]]:
+    """Returns task -> column -> return of what others published, where they have."""
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {row.pop("task"): {k: float(v) for k, v in row.items() if v} for row in rows}
+
+
+# --- scores ---
+
+
+def by_task(seeds: Iterable[Seed]) -> dict[str, list[Seed]]:
+    """Returns task -> its seeds that count: done, or failed. One that is unfinished does not."""
+    found: dict[str, list[Seed]] = {}
+    for s in sorted(seeds):
+        if s.status != "unfinished":
+            found.setdefault(s.task, []).append(s)
+    return found
+
+
+def strata(tasks: dict[str, list[Seed]]) -> list[np.ndarray]:
+    """Returns the scores of each task, [n] each."""
+    return [np.array([s.score for s in seeds]) for seeds in tasks.values()]
+
+
+def table(tasks: dict[str, list[Seed]], published: dict[str, dict[str, float]]) -> list[list[Any]]:
+    """Returns the rows of the table of tasks, the head first.
+
+    A row has IQM with its interval, the lowest seed, and what others published.
+    """
+    rows: list[list[Any]] = [
+        ["task", "n", "failed", "steps", "iqm", "low", "high", "lowest", "seconds", *SHOWN]
+    ]
+    for task, seeds in tasks.items():
+        scores = np.array([s.score for s in seeds])
+        interval = bootstrap.iqm_interval([scores])
+        rows.append(
+            [
+                task,
+                len(seeds),
+                sum(s.status == "failed" for s in seeds),
+                max((s.steps[-1] for s in seeds if s.steps), default=0),
+                round(float(bootstrap.interquartile_mean(scores)), 1),
+                *([round(x, 1) for x in interval] if interval else ["", ""]),
+                round(float(scores.min()), 1),
+                round(max((s.seconds[-1] for s in seeds if s.seconds), default=0.0)),
+                *(published.get(task, {}).get(column, "") for column in SHOWN),
+            ]
+        )
+    return rows
+
+
+def ahead(
+    tasks: dict[str, list[Seed]], published: dict[str, dict[str, float]], column: str
+) -> tuple[list[str], list[str]]:
+    """Returns the tasks whose IQM is at or above a published column, and those that fall short."""
+    compared = [task for task in tasks if column in published.get(task, {})]
+    scores = dict(zip(tasks, strata(tasks), strict=True))
+    reached = {t: bootstrap.interquartile_mean(scores[t]) >= published[t][column] for t in compared}
+    return [t for t in compared if reached[t]], [t for t in compared if not reached[t]]
+
+
+def common_curve(
+    seeds: Sequence[Seed],
+) -> tuple[list[int], bootstrap.Band, np.ndarray] | None:
+    """Returns steps [P], band, mean seconds [P] where all seeds were evaluated; None: nowhere."""
+    steps = sorted(set.intersection(*(set(s.steps) for s in seeds))) if seeds else []
+    if not steps:
+        return None
+    at = [{n: i for i, n in enumerate(s.steps)} for s in seeds]
+    values = np.array([[s.returns[i[n]] for n in steps] for s, i in zip(seeds, at, strict=True)])
+    seconds = np.array([[s.seconds[i[n]] for n in steps] for s, i in zip(seeds, at, strict=True)])
+    return steps, bootstrap.curve_band([values], number=500), seconds.mean(axis=0)
+
+
+def profile(tasks: dict[str, list[Seed]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the performance profile at `LEVELS`, with its interval: [101] each.
+
+    F(tau) = mean over tasks of the share of a task's seeds that score more than tau.
+    Agarwal et al. 2021, arXiv:2108.13264, equation 1.
+    """
+    scores = strata(tasks)
+
+    def shares(values: Sequence[np.ndarray]) -> np.ndarray:
+        return np.mean([(v[..., None] > LEVELS).mean(axis=-2) for v in values], axis=0)
+
+    low, high = np.percentile(shares(bootstrap.resample(scores, 0, 1000)), [2.5, 97.5], axis=0)
+    return shares(scores), low, high

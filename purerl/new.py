@@ -1,0 +1,46 @@
+"""Writes a project of your own: `python -m purerl.new NAME`: environment, body, experiment, test.
+
+The folder NAME needs no place in the clone. It trains at once, and its comments say what to change:
+
+    python -m purerl.new my_robot
+    cd my_robot
+    python -m purerl.run experiment.py
+"""
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from purerl.runs.command_errors import leave
+from purerl.runs.command_line import carry_out
+from purerl.runs.output import show
+
+
+@dataclass(frozen=True)
+class Options:
+    """Writes a project of your own that trains at once."""
+
+    name: Annotated[Path, tyro.conf.Positional]
+    """The folder to make, here or by its path; its last part is a Python name, such as my_robot."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    return carry_out(Options, command, "python -m purerl.new", arguments)
+
+
+def command(options: Options) -> None:
+    """Writes the files, and says how to go on."""
+    from purerl.runs.new_project import write_project
+
+    show(*map(str, write_project(options.name)), "", f"cd {shlex.quote(str(options.name))}")
+    show("python -m pytest                      # its tests")
+    show("python -m purerl.run experiment.py    # trains it")
+
+
+if __name__ == "__main__":
+    leave(main)

@@ -1,0 +1,284 @@
+"""Carries out runs, as many at once as the machine takes; it knows nothing of sweeps.
+
+All state is in the runs' folders and in the logs. Kill this process in any way: the next one finds
+which runs are done, goes on with those that were interrupted, and waits for those that still train.
+"""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from purerl.core.errors import INTERRUPTED, SUCCESS, UserError
+from purerl.report import run_reader
+from purerl.runs import checkpoint_folder
+from purerl.runs.files import make_folder
+from purerl.runs.lock import RunLock
+from purerl.runs.output import printable, warn
+from purerl.runs.run_folder import is_begun
+
+POLL = 0.2  # [s]
+TAIL = 1 << 16  # [bytes] of a log in which its last line is looked for
+LONGEST = 400  # letters of why a job failed
+RUN = ("-m", "purerl.run")
+CORES = 2  # of a run on a CPU, where NPROC says nothing else
+END = "[exit code "  # how the last line of a log begins; one without it was cut by a kill
+PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class Job(NamedTuple):
+    """One process of `python -m purerl.run`, which may train several seeds."""
+
+    name: str
+    words: tuple[str, ...]  # of the command line, without --resume
+    folders: tuple[Path, ...]  # of its runs
+    log: Path
+
+
+class Ended(NamedTuple):
+    """How a job ended."""
+
+    job: Job
+    status: str  # "done", "failed" or "stopped": it can go on
+    said: str = ""  # the last line of one that failed
+
+
+class _Active(NamedTuple):
+    job: Job
+    process: subprocess.Popen | None  # None: another process still trains it
+
+
+# --- what folders tell ---
+
+
+def is_done(job: Job) -> bool:
+    """Tells whether every run of a job has come to its end, and is saved."""
+    return all(map(_has_ended, job.folders))
+
+
+def _has_ended(folder: Path) -> bool:
+    try:
+        planned = run_reader.read(folder).planned
+    except UserError:  # not begun, or half written: the run itself says what is wrong with it
+        return False
+    return planned is not None and planned in checkpoint_folder.updates(folder / "checkpoints")
+
+
+def is_locked(job: Job) -> bool:
+    """Tells whether a process trains the job."""
+    for folder in job.folders:
+        if folder.is_dir():
+            try:
+                RunLock(folder).close()
+            except UserError:
+                return True
+            except OSError:  # the run itself will say what is wrong with it
+                return False
+    return False
+
+
+def how_it_ended(job: Job) -> Ended:
+    """Returns how a job ended that no process trains, by its folders and its log."""
+    if is_done(job):
+        return Ended(job, "done")
+    lines = _last_lines(job.log)
+    code = lines[-1].removeprefix(END).rstrip("]") if lines and lines[-1].startswith(END) else ""
+    if code in ("", str(INTERRUPTED), str(SUCCESS)):
+        return Ended(job, "stopped")
+    ours = [i for i, line in enumerate(lines) if line.startswith("purerl: ")]
+    told = lines[ours[-1] : -1] if ours else lines[-2:-1]  # ours may have lines below it
+    said = " ".join(told).removeprefix("purerl: ")[:LONGEST] or "it said nothing"
+    if code.startswith("-"):
+        said = f"killed by {signal.Signals(-int(code)).name}"
+    return Ended(job, "failed", said)
+
+
+def _last_lines(log: Path) -> list[str]:
+    """Returns the last lines of a log, from its last command on."""
+    try:
+        with log.open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
+            text = file.read().decode(errors="replace")
+    except OSError:
+        return []
+    lines = [line.strip() for line in text.replace("\r", "\n").split("\n") if line.strip()]
+    starts = [i for i, line in enumerate(lines) if line.startswith("$ ")]
+    return [printable(line) for line in lines[starts[-1] + 1 if starts else 0 :]]
+
+
+# --- the machine ---
+
+
+def find_gpus(environment: Mapping[str, str] = os.environ) -> list[str]:
+    """Returns the GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them. No JAX."""
+    if environment.get("JAX_PLATFORMS", "").startswith("cpu"):
+        return []
+    if "CUDA_VISIBLE_DEVICES" in environment:
+        names = environment["CUDA_VISIBLE_DEVICES"].split(",")
+        return [name.strip() for name in names if name.strip() not in ("", "-1")]
+    try:
+        words = ["nvidia-smi", "--list-gpus"]
+        said = subprocess.run(words, capture_output=True, text=True, timeout=30).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return []
+    found = [line for line in said.splitlines() if line.startswith("GPU ")]
+    return [str(number) for number in range(len(found))]
+
+
+def jobs_at_once(gpus: list[str], environment: Mapping[str, str] = os.environ) -> int:
+    """Returns how many runs the machine takes: one for each GPU, else for every two cores.
+
+    With NPROC, which is the number of XLA's threads in a run, it is cores / NPROC.
+    """
+    pinned = environment.get("NPROC", "")
+    threads = int(pinned) if pinned.isdigit() and int(pinned) else CORES
+    return len(gpus) or max(1, len(os.sched_getaffinity(0)) // threads)
+
+
+def environment_of(slot: int, at_once: int, gpus: list[str]) -> dict[str, str]:
+    """Returns what a job's environment has besides ours: its GPU, and its share of it.
+
+    Args:
+      slot: 0 .. at_once - 1, one that no other job has now.
+      at_once: how many jobs run at once.
+      gpus: as `find_gpus` returns them.
+    """
+    found = {}
+    if len(gpus) > 1:
+        found["CUDA_VISIBLE_DEVICES"] = gpus[slot % len(gpus)]
+    if gpus and at_once > len(gpus):  # JAX alone would take three quarters of its memory
+        share = 0.9 / -(-at_once // len(gpus))
+        found["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{share:.2f}"
+    return found
+
+
+# --- running ---
+
+
+def start(job: Job, more: Mapping[str, str], before: tuple[str, ...] = ()) -> subprocess.Popen:
+    """Starts a job, or goes on with it; what it says is appended to its log.
+
+    Args:
+      job: no process trains it.
+      more: of its environment, besides ours.
+      before: words before the command, of a shell that prepares it.
+    """
+    words = [*RUN, *job.words]
+    with contextlib.suppress(UserError):  # a broken manifest: the run will say so
+        words += ["--resume"] if any(map(is_begun, job.folders)) else []
+    make_folder(job.log.parent)
+    with job.log.open("ab") as log:
+        log.write(f"$ python {' '.join(words)}\n".encode())
+        log.flush()
+        # A session of its own: Ctrl-C in a terminal reaches this process alone, which passes it on.
+        # A second one would end the run at once.
+        return subprocess.Popen(
+            [*before, sys.executable, *words], stdin=subprocess.DEVNULL, stdout=log,
+            stderr=subprocess.STDOUT, env={**os.environ, **more}, start_new_session=True,
+        )  # fmt: skip
+
+
+def end(job: Job, code: int) -> Ended:
+    """Notes in a job's log how its process ended; returns how the job ended."""
+    with job.log.open("ab") as log:
+        log.write(f"{END}{code}]\n".encode())
+    return how_it_ended(job)
+
+
+@contextlib.contextmanager
+def _signals(pass_on: Callable[[int], None]) -> Iterator[None]:
+    """Calls `pass_on` at each signal that asks to stop."""
+    old = {n: signal.signal(n, lambda number, _: pass_on(number)) for n in PASSED_ON}
+    try:
+        yield
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)
+
+
+def carry_out(
+    jobs: Iterable[Job],
+    at_once: int,
+    gpus: list[str],
+    began: Callable[[Job], Any],
+    ended: Callable[[Ended], Any],
+) -> bool:
+    """Carries jobs out; returns whether it was asked to stop.
+
+    The next job is asked for when a slot is free, so that it may depend on those that have ended.
+    SIGINT, SIGTERM and SIGHUP are passed on: runs save and stop. A second one stops them at once.
+
+    Args:
+      jobs: those that are done are not started again.
+      at_once: how many processes.
+      gpus: which they share, in turn.
+      began: told of a job whose process has started.
+      ended: told how each job ended.
+    """
+    active: dict[int, _Active] = {}
+    received: list[int] = []
+    todo = iter(jobs)
+
+    def pass_on(number: int) -> None:
+        if not received:
+            name = signal.Signals(number).name
+            warn(f"\n{name}: {len(active)} runs save and stop. Once more to stop them at once.")
+        received.append(number)
+        for one in active.values():
+            _send(one.process, number)
+
+    def begin(slot: int, job: Job) -> None:
+        if is_locked(job):  # by a process that outlived its scheduler
+            active[slot] = _Active(job, None)
+        elif is_done(job):
+            active.pop(slot, None)
+            ended(Ended(job, "done"))
+        else:
+            process = start(job, environment_of(slot, at_once, gpus))
+            active[slot] = _Active(job, process)
+            if received:  # the signal came while it was started
+                _send(process, received[0])
+            began(job)
+
+    with _signals(pass_on):
+        try:
+            more = True
+            while active or (more and not received):
+                for slot, one in list(active.items()):
+                    if one.process is None and not received:
+                        begin(slot, one.job)
+                    elif one.process is None or one.process.poll() is not None:
+                        del active[slot]
+                        ended(_ended(one, bool(received)))
+                while more and not received and len(active) < at_once:
+                    job = next(todo, None)
+                    more = job is not None
+                    if job is not None:
+                        begin(min(set(range(at_once)) - set(active)), job)
+                time.sleep(POLL if active else 0.0)
+        finally:  # an error of ours: nothing is left behind
+            for one in active.values():
+                _send(one.process, signal.SIGTERM)
+            for one in active.values():
+                if one.process is not None:
+                    end(one.job, one.process.wait())
+    return bool(received)
+
+
+def _ended(one: _Active, asked: bool) -> Ended:
+    if one.process is None:
+        return Ended(one.job, "stopped")
+    found = end(one.job, one.process.returncode)
+    # One that was stopped while starting ends as the signal ends a program.
+    return Ended(one.job, "stopped") if asked and found.status == "failed" else found
+
+
+def _send(process: subprocess.Popen | None, number: int) -> None:
+    """Passes a signal on; a terminal that is gone (SIGHUP) asks to save as SIGTERM does."""
+    if process is not None:
+        process.send_signal(signal.SIGTERM if number == signal.SIGHUP else number)

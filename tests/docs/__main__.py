@@ -1,0 +1,48 @@
+"""Prints which blocks of the pages are executed.
+
+`python -m tests.docs PAGE...` executes pages; `--write` writes those that are made from the code.
+"""
+
+import sys
+import time
+from pathlib import Path
+
+from tests.docs import generated
+from tests.docs.blocks import EXECUTED, ROOT, blocks, pages
+from tests.docs.play import run
+
+
+def main() -> None:
+    if sys.argv[1:] == ["--write"]:
+        for path, page in generated.PAGES.items():
+            path.write_text(page())
+        return
+    if sys.argv[1:]:
+        sys.exit(max(_executed(Path(name)) for name in sys.argv[1:]))
+    ran = written = 0
+    left = []
+    for name, path in pages().items():
+        for block in blocks(path.read_text()):
+            written += bool(block.title)
+            ran += block.runs and not block.title and not block.lacks
+            if block.language in EXECUTED and block.marker == "not run":
+                left.append(f"  {name}:{block.line}: {block.words}")
+            elif block.lacks:
+                left.append(f"  {name}:{block.line}: {', '.join(block.lacks)} is not installed")
+    print(f"blocks executed: {ran}; written to files: {written}; not executed: {len(left)}")
+    print(*left, sep="\n")
+
+
+def _executed(page: Path) -> int:
+    """Executes a page; prints what it prints, and how long it took."""
+    start = time.monotonic()
+    done = run(page)
+    print(done.stdout + done.stderr)
+    shown = page.resolve()
+    shown = shown.relative_to(ROOT) if shown.is_relative_to(ROOT) else shown
+    print(f"{shown}: exit code {done.returncode}, {time.monotonic() - start:.0f} s")
+    return done.returncode
+
+
+if __name__ == "__main__":
+    main()

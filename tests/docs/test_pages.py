@@ -1,0 +1,103 @@
+"""Every code block of the pages is executed, or says why not."""
+
+import ast
+import re
+
+import pytest
+
+from tests.docs.blocks import EXECUTED, SHOWN, blocks, command, lone_markers, pages
+from tests.docs.play import run
+
+PAGES = pages()
+RUN = [name for name, path in PAGES.items() if any(b.runs for b in blocks(path.read_text()))]
+INSTALLS = re.compile(r"pip install|git clone|apt-get")
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_every_block_is_told_how_to_run(name):
+    text = PAGES[name].read_text()
+    assert not lone_markers(text)
+    for block in blocks(text):
+        place = f"{name}:{block.line}"
+        assert block.title or block.language in EXECUTED + SHOWN, f"{place}: {block.language!r}"
+        assert block.marker != "run with" or block.language == "bash", f"{place}: only of bash"
+        if block.language == "bash" and INSTALLS.search(block.code):
+            assert block.marker == "not run", f"{place}: an installation is not run"
+        if block.language == "python":
+            ast.parse(block.code, place)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RUN)
+def test_page_runs(name):
+    done = run(PAGES[name])
+    assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
+
+
+PAGE = """# A page
+
+```python title="mine/own.py"
+VALUE = 3
+```
+
+<!-- run with: world -->
+```bash
+mkdir -p there && cd there
+python -c 'import sys; open("said", "w").write(sys.argv[1] + sys.argv[2])' "hello #1" \\
+    all  # a comment
+# and one more
+```
+
+- In a list
+
+  <!-- not run: it fails -->
+  ```bash
+  exit 3
+  ```
+
+```python
+import sys
+from pathlib import Path
+sys.path.append("..")
+from mine.own import VALUE
+said = Path("said").read_text()
+```
+
+```text
+not code
+```
+
+```python
+assert (VALUE, said) == (3, "hello #1all")
+1 / LAST
+```
+"""
+
+
+def test_blocks_are_read_with_their_markers():
+    found = blocks(PAGE)
+    assert [b.language for b in found] == ["python", "bash", "bash", "python", "text", "python"]
+    assert [b.marker for b in found] == ["", "run with", "not run", "", "", ""]
+    assert command(found[1]).endswith("    all world")
+    assert found[2].code == "exit 3\n"
+    assert found[0].title == "mine/own.py"
+
+
+def test_a_marker_that_marks_nothing_is_found():
+    good = "<!-- not run: it is long -->\n```bash\n```\n"
+    assert not lone_markers(good)
+    for bad in (good.replace("it is long ", ""), good.replace("\n", "\n\n", 1), good[:20] + "-->"):
+        assert lone_markers(bad) == [1], bad
+
+
+@pytest.mark.slow
+def test_a_page_is_executed_in_order_and_stops_where_it_fails(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(PAGE.replace("LAST", "1"))
+    assert run(page).returncode == 0
+    page.write_text(PAGE.replace("LAST", "0"))
+    done = run(page)
+    assert done.returncode == 1
+    assert f'page.md", line {PAGE[: PAGE.index("1 / LAST")].count(chr(10)) + 1}' in done.stderr
+    page.write_text("```bash\nfalse\ntrue\n```\n")
+    assert "line 2: exit code 1" in run(page).stderr

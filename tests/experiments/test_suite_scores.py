@@ -1,0 +1,96 @@
+"""The control suite's scores: what counts, what is read back, what is ahead of whom."""
+
+import argparse
+
+import numpy as np
+import pytest
+
+from envs.suite.tasks import TASKS
+from experiments.benchmarks import suite_benchmark, suite_pictures, suite_scores
+from experiments.benchmarks.suite_scores import Seed
+
+
+def seed(number, *returns, task="cheetah-run", status="done"):
+    steps = tuple(range(10, 10 * len(returns) + 1, 10))
+    return Seed(task, number, status, steps, returns, tuple(s / 10 for s in steps))
+
+
+SEEDS = [
+    *(seed(i, 100.0 * i, 200.0 * i) for i in range(1, 6)),
+    seed(1, 5.0, 30.0, task="hopper-hop"),
+    seed(2, task="hopper-hop", status="failed"),
+    seed(3, 900.0, task="hopper-hop", status="unfinished"),
+]
+
+
+def test_a_seed_that_failed_counts_and_one_that_is_unfinished_does_not():
+    tasks = suite_scores.by_task(SEEDS)
+    assert [s.seed for s in tasks["hopper-hop"]] == [1, 2]
+    np.testing.assert_array_equal(suite_scores.strata(tasks)[1], [30.0, 0.0])
+    head, cheetah, hopper = suite_scores.table(tasks, {"hopper-hop": {"brax_ppo_end": 2.0}})
+    row = dict(zip(head, hopper, strict=True))
+    assert (row["n"], row["failed"], row["lowest"], row["iqm"], row["low"]) == (2, 1, 0.0, 15.0, "")
+    assert row["brax_ppo_end"] == 2.0 and row["reppo_end"] == ""
+    row = dict(zip(head, cheetah, strict=True))
+    assert (row["iqm"], row["lowest"], row["steps"], row["seconds"]) == (600.0, 200.0, 20, 2)
+    assert row["low"] < 600 < row["high"]
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    suite_scores.write_seeds(tmp_path / "seeds.csv", SEEDS)
+    assert sorted(suite_scores.read_seeds(tmp_path / "seeds.csv")) == sorted(SEEDS)
+
+
+def test_ahead_is_at_or_above():
+    tasks = suite_scores.by_task(SEEDS)
+    published = {"cheetah-run": {"x": 600.0, "y": 600.1}, "hopper-hop": {"x": 15.1}}
+    assert suite_scores.ahead(tasks, published, "x") == (["cheetah-run"], ["hopper-hop"])
+    assert suite_scores.ahead(tasks, published, "y") == ([], ["cheetah-run"])
+
+
+def test_the_profile_weighs_tasks_equally():
+    share, low, high = suite_scores.profile(suite_scores.by_task(SEEDS))
+    at = {level: share[i] for i, level in enumerate(suite_scores.LEVELS)}
+    assert at[0.0] == pytest.approx((1 + 0.5) / 2)
+    assert at[500.0] == pytest.approx((3 / 5 + 0) / 2)
+    assert at[1000.0] == 0.0
+    assert (low <= share + 1e-9).all() and (share <= high + 1e-9).all()
+
+
+def test_curves_are_where_all_seeds_were_evaluated(tmp_path):
+    longer = [seed(1, 0.0, 10.0, 20.0), seed(2, 2.0, 30.0)]
+    steps, band, seconds = suite_scores.common_curve(longer)
+    assert steps == [10, 20]
+    np.testing.assert_allclose(band.iqm, [1.0, 20.0])
+    np.testing.assert_allclose(seconds, [1.0, 2.0])
+    assert suite_scores.common_curve([seed(1, 1.0), seed(2)]) is None
+    assert suite_pictures.together({"a": longer, "b": [seed(1, 7.0)]})[0] == [10]
+
+
+def test_every_published_task_has_our_name():
+    published = suite_scores.references()
+    assert len(published) == 25
+    assert published["cheetah-run"]["brax_ppo_end"] == 829
+    assert "tdmpc2_4M" not in published["point_mass-easy"]  # an empty cell
+    assert len(published.keys() & TASKS.keys()) >= 18
+
+
+def test_a_seed_that_never_had_a_folder_counts_as_failed():
+    asked = argparse.Namespace(tasks=["cheetah-run", "hopper-hop"], first_seed=1, seeds=3)
+    missing = suite_benchmark.never_begun(asked, SEEDS)
+    assert [(s.task, s.seed, s.status, s.score) for s in missing] == []
+    missing = suite_benchmark.never_begun(asked, [s for s in SEEDS if s.seed != 2])
+    assert [(s.task, s.seed, s.score) for s in missing] == [
+        ("cheetah-run", 2, 0.0),
+        ("hopper-hop", 2, 0.0),
+    ]
+    assert len(suite_scores.by_task(missing)["hopper-hop"]) == 1
+
+
+@pytest.mark.slow
+def test_pictures_are_drawn(tmp_path):
+    tasks = suite_scores.by_task([s for s in SEEDS if s.task == "cheetah-run"])
+    for across in ("steps", "seconds"):
+        suite_pictures.draw_tasks(tmp_path / "a.png", tasks, suite_scores.references(), across)
+    suite_pictures.draw_together(tmp_path / "b.png", tasks)
+    assert (tmp_path / "a.png").stat().st_size > 5000 < (tmp_path / "b.png").stat().st_size

@@ -1,0 +1,241 @@
+"""`python -m purerl.check`: a broken environment or network for each check, which finds just it."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from purerl.core.records import Network, Normal, PolicyOutput
+from purerl.physics.interface import Physics
+from purerl.ppo.networks import MlpOptions, RecurrentOptions, from_linen, mlp, recurrent
+from purerl.runs import examine_env, examine_network
+from purerl.runs.watch_physics import check_controls, check_placed
+from tests.runs.test_check_env import Toy, toy_state
+
+pytestmark = pytest.mark.slow
+
+
+def bad(findings):
+    """Returns what is not well, about -> text."""
+    return {one.about: f"{one.level}: {one.text}" for one in findings if one.level != "ok"}
+
+
+class Counting(Toy):
+    def step(self, state, action):
+        object.__setattr__(self, "calls", getattr(self, "calls", 0) + 1)
+        return super().step(state, action)
+
+
+class Deaf(Toy):
+    def reset(self, key):
+        return toy_state(jnp.ones(2))
+
+
+class NanTerm(Toy):
+    def step(self, state, action):
+        term = jnp.log(-1.0 - action[0] ** 2)
+        return super().step(state, action).replace(metrics={"distance": term})
+
+
+class OverAtOnce(Toy):
+    def reset(self, key):
+        return super().reset(key).replace(terminated=jnp.ones((), bool))
+
+
+class OneStep(Toy):
+    def step(self, state, action):
+        return super().step(state, action).replace(terminated=jnp.ones((), bool))
+
+
+class NoReward(Toy):
+    def step(self, state, action):
+        return super().step(state, action).replace(reward=jnp.zeros(()))
+
+    def reset(self, key):
+        return super().reset(key).replace(reward=jnp.zeros(()))
+
+
+def seen(position, entry):
+    state = toy_state(position)
+    return state.replace(observation={"policy": jnp.append(position, entry)})
+
+
+@dataclasses.dataclass(frozen=True)
+class Seeing(Toy):
+    scale: float = 1.0
+    offset: float = 0.0
+
+    def reset(self, key):
+        return self._seen(super().reset(key))
+
+    def step(self, state, action):
+        return self._seen(super().step(state, action))
+
+    def _seen(self, state):
+        return seen(state.physics, self.offset + self.scale * state.physics[0])
+
+
+class HalfDeaf(Toy):
+    def step(self, state, action):
+        return super().step(state, action.at[1].set(0.0))
+
+
+class WrongReward(Toy):
+    def step(self, state, action):
+        return super().step(state, action).replace(reward=jnp.zeros(1))
+
+
+@pytest.mark.parametrize(
+    ("env", "about", "text"),
+    [
+        (Counting(), "own state", "error: reset or step sets env.calls"),
+        (Deaf(), "keys", "warning: physics, observation and task are the same"),
+        (NanTerm(), "finite", "error: metrics/distance is not finite after every step"),
+        (OverAtOnce(), "ends", "error: 16 of 16 episodes have ended when reset returns"),
+        (OneStep(), "ends", "error: every episode ends at its first step"),
+        (NoReward(), "reward", "warning: it is 0 at every one of"),
+        (Seeing(scale=0.0), "scale", "warning: observation/policy [2] does not vary"),
+        (Seeing(offset=1e5), "scale", "warning: observation/policy [2] varies by less than 1/"),
+        (Seeing(scale=1e5), "scale", "warning: observation/policy [2] has a std beyond 10000"),
+        (HalfDeaf(), "actions", "warning: entries 1 of 2 change nothing in"),
+        (WrongReward(), "protocol", "error: reward is float32 [] from reset and float32 [1]"),
+    ],
+)
+def test_it_finds_just_what_is_broken(env, about, text):
+    found = bad(examine_env.examine(env))
+    assert list(found) == [about] and found[about].startswith(text)
+
+
+def test_it_finds_nothing_in_a_good_one():
+    assert not bad(examine_env.examine(Toy())) and not bad(examine_env.examine(Seeing()))
+
+
+def test_a_start_shows_what_it_can():
+    def starts(env):
+        return jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 4))
+
+    assert not examine_env.first_state(starts(Toy()))
+    both = jax.tree.map(lambda x: jnp.stack([x, x]), starts(Deaf()))  # vmapped seeds
+    assert list(bad(examine_env.first_state(both))) == ["keys"]
+    assert "4 of 4" in bad(examine_env.first_state(starts(OverAtOnce())))["ends"]
+
+
+XML = """<mujoco><worldbody><body><joint name="slide" type="slide"/><geom size="0.1"/></body>
+<body name="goal" mocap="true" pos="1 0 0"><geom size="0.1"/></body></worldbody>
+<actuator><motor name="push" joint="slide" ctrllimited="true" ctrlrange="-1 1"/></actuator>
+</mujoco>"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pushed(Toy):
+    """A body and a goal."""
+
+    physics: Physics
+    strength: float = 1.0
+    late: bool = False
+    action_size = 1
+
+    def reset(self, key):
+        goal = jax.random.normal(key, (2, 3))
+        start = (jnp.zeros(1), jnp.zeros(1))
+        physics, readings = self.physics.init(*start, {"body_pos": jnp.pad(goal, ((1, 0), (0, 0)))})
+        if self.late:
+            physics = physics.replace(mocap_pos=goal[:1])
+        return toy_state(readings.xpos[2, :2]).replace(physics=physics)
+
+    def step(self, state, action):
+        physics, readings = self.physics.step(state.physics, self.strength * action)
+        return toy_state(readings.xpos[2, :2]).replace(physics=physics)
+
+
+def pushed(**how):
+    return Pushed(physics=Physics(mujoco.MjModel.from_xml_string(XML), ("xpos",)), **how)
+
+
+@pytest.mark.parametrize(("strength", "found"), [(1.0, False), (2.0, True)])
+def test_controls_beyond_the_range(strength, found):
+    env = pushed(strength=strength)
+    keys = jax.random.split(jax.random.key(0), 2)
+    actions = jnp.linspace(-1.0, 1.0, 6).reshape(3, 2, 1)
+    trial = SimpleNamespace(start=jax.vmap(env.reset)(keys), actions=actions)
+    said = bad(check_controls(env, trial))
+    assert bool(said) == found
+    assert not found or "push gets -2 to 2, and has -1 to 1" in said["controls"]
+    assert "step" not in vars(env.physics), "left as it was"
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_goal_that_is_placed_late(late):
+    said = bad(check_placed(pushed(late=late)))
+    assert bool(said) == late
+    assert not late or 'by init\'s changes={"body_pos": ...}' in said["placing"]
+
+
+# --- networks ---
+
+OBSERVATION = {
+    "policy": np.random.default_rng(0).normal(size=(8, 3)).astype(np.float32),
+    "privileged": np.random.default_rng(1).normal(size=(8, 2)).astype(np.float32),
+}
+ONE = {name: jnp.zeros(x.shape[1:]) for name, x in OBSERVATION.items()}
+
+
+@dataclasses.dataclass(frozen=True)
+class Flaw:
+    value_reads: tuple = ("policy", "privileged")
+    policy_reads: tuple = ("policy",)
+    idle: bool = False
+    nan: bool = False
+
+
+class Small(nn.Module):
+    flaw: Flaw
+
+    @nn.compact
+    def __call__(self, observation):
+        def read(names):
+            return sum(nn.Dense(1, name=None)(observation[name]) for name in names)
+
+        loc, value = read(self.flaw.policy_reads), read(self.flaw.value_reads)[..., 0]
+        if self.flaw.idle:
+            self.param("idle", nn.initializers.ones, (2,))
+        value = jnp.log(-jnp.exp(value)) if self.flaw.nan else value
+        scale = jnp.exp(self.param("scale", nn.initializers.zeros, (1,)))
+        return PolicyOutput(Normal(loc, jnp.broadcast_to(scale, loc.shape)), value)
+
+
+@pytest.mark.parametrize(
+    ("flaw", "about", "text"),
+    [
+        (Flaw(), None, ""),
+        (Flaw(value_reads=("policy",)), "inputs", "depend on observation['privileged']"),
+        (Flaw(policy_reads=("policy", "privileged")), "inputs", "policy reads observation['priv"),
+        (Flaw(idle=True), "gradients", "params/idle has none: it is never trained"),
+        (Flaw(nan=True), "outputs", "value is not finite"),
+    ],
+)
+def test_a_network(flaw, about, text):
+    found = bad(examine_network.examine(from_linen(Small(flaw), ONE), OBSERVATION))
+    assert list(found) == ([about] if about else [])
+    assert text in found.get(about, "")
+
+
+def test_our_networks_are_well():
+    assert not bad(examine_network.examine(mlp(MlpOptions(), ONE, 2), OBSERVATION))
+    lstm = recurrent(RecurrentOptions(cell="lstm", hidden=8), ONE, 2)
+    assert not bad(examine_network.examine(lstm, OBSERVATION))
+
+
+def test_a_memory_that_never_changes():
+    init, apply = recurrent(RecurrentOptions(hidden=8), ONE, 2)
+
+    def forgetful(params, observation, carry):
+        return apply(params, observation, carry)[0], carry
+
+    found = bad(examine_network.examine(Network(init, forgetful), OBSERVATION))
+    assert "never changes" in found["memory"]
