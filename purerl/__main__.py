@@ -11,8 +11,8 @@ from purerl.runs.experiment import summary
 from purerl.runs.output import show
 
 COMMANDS = (
-    "new", "check", "run", "evaluate", "render", "record", "export", "compare", "report", "plot",
-    "sweep", "plan",
+    "new", "check", "run", "evaluate", "render", "view", "record", "export", "compare", "report",
+    "plot", "sweep", "plan",
 )  # fmt: skip
 
 HERE = Path(__file__).parent

@@ -24,6 +24,7 @@ class RestoredRun(NamedTuple):
     experiment: Experiment
     setup: Setup
     saved: checkpoint.Saved
+    source: Source  # the experiment as its file has it
 
 
 def restore(
@@ -61,10 +62,15 @@ def restore(
         say(f"{what} is not that of the run any more.")
     for what in edited(folder):
         say(f"Edited since the run: {what}.")
+    return RestoredRun(chosen, setup, read_checkpoint(folder, update, setup, say), source)
+
+
+def read_checkpoint(folder: Path, update: str, setup: Setup, say: Say) -> checkpoint.Saved:
+    """Reads a checkpoint of a run whose objects are built; arguments as for `restore`."""
     abstract = abstract_state(*setup[:3])
     abstract = abstract.replace(env=None, episode=None, optimizer=None)
     _check_memory(folder, memory.size(abstract))
-    return RestoredRun(chosen, setup, _choose(folder / "checkpoints", update, abstract, say, begun))
+    return _choose(folder / "checkpoints", update, abstract, say, manifest.read(folder))
 
 
 def _check_memory(folder: Path, size: int) -> None:

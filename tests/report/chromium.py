@@ -50,10 +50,12 @@ class Browser:
         assert "result" in answer, answer
         return answer["result"]
 
-    def open(self, path: Path, width: int = 1240, height: int = 900) -> None:
+    def open(self, path: Path | str, width: int = 1240, height: int = 900) -> None:
+        """Opens a file, or an address."""
         self.size(width, height)
         before = len(self.events)
-        self.ask("Page.navigate", url=path.absolute().as_uri())
+        url = path if isinstance(path, str) else path.absolute().as_uri()
+        self.ask("Page.navigate", url=url)
         while not any(e.get("method") == "Page.loadEventFired" for e in self.events[before:]):
             self.events.append(self._read())
 
@@ -88,6 +90,16 @@ class Browser:
         for kind in ("mousePressed", "mouseReleased"):
             self._mouse(kind, *self.at, button="left", clickCount=1)
 
+    def drag(self, path: list[tuple[float, float]]) -> None:
+        """Draws the pointer from place to place [pixels], its button held."""
+        self._mouse("mouseMoved", *path[0])
+        self._mouse("mousePressed", *path[0], button="left", clickCount=1)
+        for place in path[1:]:
+            self._mouse("mouseMoved", *place, button="left", buttons=1)
+
+    def drop(self, place: tuple[float, float]) -> None:
+        self._mouse("mouseReleased", *place, button="left", clickCount=1)
+
     def picture(self, path: Path, whole: bool = True) -> None:
         found = self.ask("Page.captureScreenshot", captureBeyondViewport=whole)
         path.write_bytes(base64.b64decode(found["data"]))
@@ -104,14 +116,14 @@ class Browser:
 
 
 @contextlib.contextmanager
-def browser():
-    """Starts Chromium, and ends it."""
+def browser(*flags: str):
+    """Starts Chromium, with more flags, and ends it."""
     theirs_in, write = os.pipe()
     read, theirs_out = os.pipe()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as home:
         # It reads from file 3 and writes to file 4.
         code = f'exec "$@" 3<&{theirs_in} 4>&{theirs_out}'
-        words = ["bash", "-c", code, "chromium", find(), *FLAGS, f"--user-data-dir={home}"]
+        words = ["bash", "-c", code, "chromium", find(), *FLAGS, *flags, f"--user-data-dir={home}"]
         process = subprocess.Popen(
             words, pass_fds=(theirs_in, theirs_out), stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

@@ -22,7 +22,7 @@ from tests.ppo.probes import Probe
 ROOT = Path(__file__).parent.parent.parent
 TOY = Path(__file__).parent / "toy_experiment.py"
 ROOMS = sorted(path.parent.name for path in (ROOT / "purerl").glob("*/__init__.py"))
-LOOKING = {"plan", "report", "sweep"}  # they only start runs, or look at what one has written
+LOOKING = {"plan", "report", "sweep", "view"}  # they only start runs, or look at what they wrote
 AN_EDIT = "\n# An edit.\n"
 
 

@@ -1,0 +1,232 @@
+"""A model's geoms as few batches of equal shapes, which a browser draws at once; pure.
+
+A batch is one mesh, drawn many times, each with a place, a rotation and a size of its own. So a
+body is a handful of messages a frame, and a corridor whose boxes move and stretch from step to
+step costs no more than one that does not. (mjviser, which draws MuJoCo's models in the same
+browser page, bakes every geom into a mesh when it starts. To show another gap it would make all
+meshes anew: 0.3 s for an ant, 0.9 s for a rodent, against 0.2 ms: docs/howto/view.md.)
+"""
+
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from purerl.report.episode_pictures import Picture
+
+SPHERE, ROD, BOX = "sphere", "rod", "box"
+_GEOM = mujoco.mjtGeom
+_PARTS = {  # a capsule is a rod and two spheres: it cannot be stretched as a whole
+    int(_GEOM.mjGEOM_SPHERE): (SPHERE,),
+    int(_GEOM.mjGEOM_ELLIPSOID): (SPHERE,),
+    int(_GEOM.mjGEOM_CAPSULE): (ROD, SPHERE, SPHERE),
+    int(_GEOM.mjGEOM_CYLINDER): (ROD,),
+    int(_GEOM.mjGEOM_BOX): (BOX,),
+}
+SHOWN_GROUPS = 3  # MuJoCo's own viewers show geoms of groups 0, 1 and 2
+SCENERY_COLOR = np.array([102, 115, 128])
+
+
+class Mesh(NamedTuple):
+    """A surface: vertices [V, 3] [m], faces [F, 3] of them."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+class Batch(NamedTuple):
+    """One mesh that stands for N parts of geoms."""
+
+    mesh: Mesh
+    shape: str  # SPHERE, ROD, BOX, or a mesh's name
+    geoms: np.ndarray  # [N] int
+    sides: np.ndarray  # [N] of a capsule's spheres: 1 above, -1 below; 0 in the middle
+    colors: np.ndarray  # [N, 3] uint8, as a screen shows them
+    opacities: np.ndarray  # [N] in [0, 1]
+    moving: bool  # whether they belong to a body that can move
+
+
+class Layout(NamedTuple):
+    """Where the N parts of a batch are."""
+
+    positions: np.ndarray  # [N, 3] [m]
+    wxyzs: np.ndarray  # [N, 4]
+    scales: np.ndarray  # [N, 3]
+
+
+def drawable(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Returns a copy of a model that heeds changed places of geoms (see `report.renderer`)."""
+    model = mujoco.MjModel.__copy__(model)
+    model.geom_sameframe[:] = model.site_sameframe[:] = model.body_sameframe[:] = 0
+    return model
+
+
+def pose(model: mujoco.MjModel, data: mujoco.MjData, picture: Picture) -> None:
+    """Puts a `drawable` model into the place and form of a picture."""
+    for name, values in picture.changes.items():
+        getattr(model, name)[...] = values
+    data.qpos[:] = picture.qpos
+    data.mocap_pos[:], data.mocap_quat[:] = picture.mocap_pos, picture.mocap_quat
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+
+
+def batches(model: mujoco.MjModel) -> dict[str, Batch]:
+    """Returns a model's visible geoms as batches, by name; planes and height fields are none."""
+    found: dict[str, Batch] = {}
+    for moving in (False, True):
+        parts: dict[str, list[tuple[int, int]]] = {}
+        for geom in filter(lambda i: _is_shown(model, i), range(model.ngeom)):
+            if (model.body_weldid[model.geom_bodyid[geom]] != 0) == moving:
+                for number, name in enumerate(_part_names(model, geom)):
+                    parts.setdefault(name, []).append((geom, (0, 1, -1)[number]))
+        for name, chosen in parts.items():
+            geoms, sides = (np.array(column) for column in zip(*chosen, strict=True))
+            rgba = np.array([_rgba(model, geom) for geom in geoms])
+            found[f"{'body' if moving else 'ground'}/{name}"] = Batch(
+                mesh=_mesh(model, name),
+                shape=name,
+                geoms=geoms,
+                sides=sides,
+                colors=np.asarray(255 * rgba[:, :3], np.uint8),
+                opacities=np.asarray(rgba[:, 3], np.float32),
+                moving=moving,
+            )
+    return found
+
+
+def layout(model: mujoco.MjModel, data: mujoco.MjData, batch: Batch) -> Layout:
+    """Returns where a batch's parts are in a model that `pose` has put into place."""
+    geoms, size = batch.geoms, model.geom_size[batch.geoms]
+    rotations = data.geom_xmat[geoms].reshape(-1, 3, 3)
+    along = (batch.sides * size[:, 1])[:, None] * rotations[:, :, 2]
+    return Layout(
+        positions=np.asarray(data.geom_xpos[geoms] + along, np.float32),
+        wxyzs=np.asarray(_quaternions(rotations), np.float32),
+        scales=np.asarray(_scales(batch.shape, model.geom_type[geoms], size), np.float32),
+    )
+
+
+def scenery_layout(picture: Picture) -> Layout | None:
+    """Returns the boxes of an episode that are only drawn; None if there are none."""
+    if not picture.scenery or not len(picture.scenery[0]):
+        return None
+    centers, half = (np.asarray(x, np.float32) for x in picture.scenery)
+    # 2 mm smaller: where the model has the same box, its surface and not this one is seen.
+    upright = np.tile(np.asarray([1, 0, 0, 0], np.float32), (len(centers), 1))
+    return Layout(centers, upright, np.maximum(half - 0.002, 1e-4))
+
+
+def as_light(colors: np.ndarray) -> np.ndarray:
+    """Returns a screen's colors [..., 3] in proportion to light: viser takes a batch's so."""
+    return np.asarray(255 * (colors / 255) ** 2.2, np.uint8)
+
+
+def planes(model: mujoco.MjModel) -> list[int]:
+    """Returns the visible planes, which are drawn as grids."""
+    kind = int(_GEOM.mjGEOM_PLANE)
+    return [i for i in range(model.ngeom) if model.geom_type[i] == kind and _is_shown(model, i)]
+
+
+def _is_shown(model: mujoco.MjModel, geom: int) -> bool:
+    return bool(model.geom_group[geom] < SHOWN_GROUPS and _rgba(model, geom)[3] > 0)
+
+
+def _rgba(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """Returns a geom's color [4] in [0, 1]: its material's, unless it has one of its own."""
+    material, own = model.geom_matid[geom], model.geom_rgba[geom]
+    plain = material < 0 or not np.allclose(own, 0.5 * np.array([1, 1, 1, 2]))
+    rgba = own if plain else model.mat_rgba[material].copy()
+    if not plain and (texture := model.mat_texid[material].max()) >= 0:
+        start, depth = model.tex_adr[texture], model.tex_nchannel[texture]
+        size = model.tex_height[texture] * model.tex_width[texture] * depth
+        pixels = model.tex_data[start : start + size].reshape(-1, depth)
+        rgba[: min(depth, 3)] *= pixels.mean(axis=0)[:3] / 255  # a browser's mesh has one color
+    return np.clip(rgba, 0.0, 1.0)
+
+
+def _part_names(model: mujoco.MjModel, geom: int) -> tuple[str, ...]:
+    kind = int(model.geom_type[geom])
+    if kind == int(_GEOM.mjGEOM_MESH):
+        return (f"mesh{model.geom_dataid[geom]}",)
+    return _PARTS.get(kind, ())
+
+
+def _scales(shape: str, kinds: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Returns the sizes [N, 3] of unit meshes of a shape, which are parts of geoms."""
+    radius, half = size[:, :1], size[:, 1:2]
+    if shape == SPHERE:
+        ellipsoid = (kinds == int(_GEOM.mjGEOM_ELLIPSOID))[:, None]
+        return np.where(ellipsoid, size, radius)
+    if shape == ROD:
+        return np.concatenate([radius, radius, half], axis=1)
+    return size if shape == BOX else np.ones_like(size)
+
+
+def _quaternions(rotations: np.ndarray) -> np.ndarray:
+    """Returns [N, 3, 3] rotations as quaternions [N, 4], w first."""
+    found = np.zeros((len(rotations), 4))
+    for quaternion, rotation in zip(found, rotations, strict=True):
+        mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+    return found
+
+
+def _mesh(model: mujoco.MjModel, name: str) -> Mesh:
+    unit: dict[str, Any] = {SPHERE: unit_sphere, ROD: unit_rod, BOX: unit_box}
+    if name in unit:
+        return unit[name]()
+    mesh = int(name.removeprefix("mesh"))
+    vertices = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
+    faces = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
+    return Mesh(
+        np.asarray(model.mesh_vert[vertices], np.float32),
+        np.asarray(model.mesh_face[faces], np.uint32),
+    )
+
+
+def _float_mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    return Mesh(np.asarray(vertices, np.float32), np.asarray(faces, np.uint32))
+
+
+def unit_sphere(rings: int = 12) -> Mesh:
+    """Returns a sphere of radius 1."""
+    polar, around = np.linspace(0, np.pi, rings + 1), np.linspace(0, 2 * np.pi, 2 * rings + 1)
+    polar, around = np.meshgrid(polar, around, indexing="ij")
+    points = [np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)]
+    return Mesh(
+        np.asarray(np.stack(points, -1).reshape(-1, 3), np.float32), _grid_faces(*polar.shape)
+    )
+
+
+def unit_rod(sides: int = 24) -> Mesh:
+    """Returns a cylinder of radius 1 from z = -1 to 1, with lids."""
+    around = np.linspace(0, 2 * np.pi, sides + 1)
+    x, y = np.cos(around), np.sin(around)
+    rows = [(0, 1), (1, 1), (1, 1), (1, -1), (1, -1), (0, -1)]  # radius and z; edges stay sharp
+    points = [np.stack([r * x, r * y, np.full_like(x, z)], -1) for r, z in rows]
+    faces = _grid_faces(len(rows), sides + 1)[_sound(sides)]
+    return _float_mesh(np.concatenate(points), faces)
+
+
+def _sound(sides: int) -> np.ndarray:
+    """Returns which faces of the rod's five bands to keep: the two between equal rows are flat."""
+    return np.repeat([True, False, True, False, True], 2 * sides)
+
+
+def unit_box() -> Mesh:
+    """Returns a box from -1 to 1, each side with corners of its own, so that edges are sharp."""
+    square = np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], np.float32)
+    turns = [np.roll(square, shift, axis=1) * sign for shift in (0, 1, 2) for sign in (1, -1)]
+    faces = [
+        np.array([[0, 1, 2], [0, 2, 3]])[:, :: -1 if number % 2 else 1] + 4 * number
+        for number in range(6)
+    ]
+    return _float_mesh(np.concatenate(turns), np.concatenate(faces))
+
+
+def _grid_faces(rows: int, columns: int) -> np.ndarray:
+    """Returns the triangles of a surface of rows x columns vertices, seen from outside."""
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    first = np.stack([corner, corner + columns, corner + columns + 1], -1)
+    second = np.stack([corner, corner + columns + 1, corner + 1], -1)
+    return np.asarray(np.stack([first, second], 1).reshape(-1, 3), np.uint32)
