@@ -49,7 +49,7 @@ _NAMES = {
     "exact": "exact",
     "physics.interface": "Physics PhysicsState choose_engine overflow_metric overflow_reading",
     "physics.lookup": "lookup",
-    "plan.planner": "planner",
+    "tune.plan.planner": "planner",
     "ppo.config": "Config Evaluation",
     "ppo.networks": "networks",
     "runs.check_env": "check_env",

@@ -21,7 +21,6 @@ from purerl.physics.interface import (
     overflow_metric as overflow_metric,
     overflow_reading as overflow_reading,
 )
-from purerl.plan import planner as planner
 from purerl.ppo import networks as networks
 from purerl.ppo.config import Config as Config, Evaluation as Evaluation
 from purerl.runs.check_env import check_env as check_env
@@ -29,5 +28,6 @@ from purerl.runs.experiment import Experiment as Experiment, find as find
 from purerl.runs.loaded_run import Run as Run, load as load
 from purerl.runs.policy import Policy as Policy
 from purerl.runs.training import train as train
+from purerl.tune.plan import planner as planner
 
 __version__: str

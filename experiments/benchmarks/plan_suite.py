@@ -25,13 +25,13 @@ import numpy as np
 from envs.suite.tasks import TASKS, Options as SuiteOptions
 from experiments.benchmarks.output import output_file
 from purerl.devices.compilation import set_up_jax
-from purerl.plan import episodes, planner
-from purerl.plan.figures import said
-from purerl.plan.settings import Settings
 from purerl.runs.build_experiment import build
 from purerl.runs.command_errors import leave
 from purerl.runs.experiment import Experiment, available, find
 from purerl.runs.loaded_run import load
+from purerl.tune.plan import episodes, planner
+from purerl.tune.plan.figures import said
+from purerl.tune.plan.settings import Settings
 
 MUST_SHOW = ("cartpole-swingup", "walker-walk", "cheetah-run", "hopper-hop", "humanoid-stand")
 # A lying hopper earns 0 whatever it does, until a wild movement has thrown it up.

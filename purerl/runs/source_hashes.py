@@ -13,7 +13,7 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parent.parent
 # Rooms that only start runs, or look at what one has written.
-AFTERWARDS = {"plan", "report", "sweep", "view"}
+AFTERWARDS = {"report", "tune"}
 
 
 def source_hashes(builders: Iterable[Callable], package: Path = PACKAGE) -> dict[str, str]:

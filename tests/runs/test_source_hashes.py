@@ -22,7 +22,7 @@ from tests.ppo.probes import Probe
 ROOT = Path(__file__).parent.parent.parent
 TOY = Path(__file__).parent / "toy_experiment.py"
 ROOMS = sorted(path.parent.name for path in (ROOT / "purerl").glob("*/__init__.py"))
-LOOKING = {"plan", "report", "sweep", "view"}  # they only start runs, or look at what they wrote
+LOOKING = {"report", "tune"}  # they only start runs, or look at what they wrote
 AN_EDIT = "\n# An edit.\n"
 
 
@@ -97,7 +97,7 @@ def test_an_edited_package_refuses_to_resume_and_names_what_was_edited(copy, tmp
     runs = tmp_path / "runs"
     assert run.main([str(TOY), "--runs", str(runs)]) == SUCCESS
     edit(copy / "report" / "run_reader.py")
-    edit(copy / "sweep" / "scheduler.py")
+    edit(copy / "tune" / "sweep" / "scheduler.py")
     edit(copy / "compare.py")
     done = resume(copy, runs)
     assert (done.returncode, done.stderr) == (SUCCESS, "")

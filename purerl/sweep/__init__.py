@@ -1,6 +1,0 @@
-"""Sweeps: many runs of one experiment, each with other settings, and what came of them.
-
-May import: core, runs, report. Read: `spaces.py` and `points.py` (which settings),
-`scheduler.py` (running them, which knows nothing of sweeps), `table.py` (what came of them). An
-edit here does not keep a run from resuming.
-"""

@@ -1,0 +1,146 @@
+"""Episodes that a planner plays, as arrays: the beginnings are those of `evaluate`."""
+
+import functools
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from purerl.core.env import Env, State
+from purerl.core.keys import Purpose, derive, per_environment
+from purerl.core.records import Array
+from purerl.devices.compilation import jit
+from purerl.ppo import evaluation, rollout
+from purerl.ppo.config import Config
+from purerl.ppo.evaluation import Progress
+from purerl.tune.plan import planner
+from purerl.tune.plan.planner import Guide, Plan
+from purerl.tune.plan.settings import Settings
+
+CHUNK = 20  # control steps that one call of the program plays
+
+
+class Playing(NamedTuple):
+    """Episodes that are being played, [E, ...]."""
+
+    progress: Progress
+    plan: Plan
+
+
+class NoMemory(NamedTuple):
+    """Stands for the state of a run where nothing but the shape of a memory is asked for."""
+
+    carry: tuple = ()
+
+
+def begin(
+    config: Config, settings: Settings, env: Env, guide: Guide, key: Array, number: int
+) -> Playing:
+    """Returns E episodes about to start, by a key [] that nothing else uses."""
+    nothing: Any = NoMemory()
+    progress = evaluation.start(config, env, nothing, key, number)
+    plans = jax.tree.map(
+        lambda x: jnp.broadcast_to(x, (number, *x.shape)), planner.start(settings, env, guide)
+    )
+    return Playing(progress, plans)
+
+
+def advance(
+    settings: Settings,
+    env: Env,
+    judges: Mapping[str, Env],
+    keep: Callable[[State], Any],
+    guide: Guide,
+    key: Array,
+    playing: Playing,
+) -> tuple[Playing, dict[str, Any]]:
+    """Plans and takes one control step in each of E episodes; pure.
+
+    Args:
+      settings: of the planner.
+      env: the environment.
+      judges: name -> the environment under other settings: each gives the reward that it would
+        have given for the same action in the same state.
+      keep: what to keep of each state, before the step; of one environment.
+      guide: see `planner.plan`.
+      key: [] typed, of all steps.
+      playing: the episodes.
+
+    Returns:
+      The episodes one step later, and arrays [E, ...] by name: "running", whether the step belongs
+      to the episode, "kept", "action", "reward", "metrics" and "judged".
+    """
+    now, number = playing.progress, len(playing.progress.over)
+    step_key = jax.random.fold_in(key, now.t)
+    keys = per_environment(step_key, jnp.arange(number))
+    choose = functools.partial(planner.plan, settings, env, guide)
+    plans, action = jax.vmap(choose)(playing.plan, now.env, keys)
+    following = evaluation.advance(env, now, action, ())
+    judged = {name: jax.vmap(judge.step)(now.env, action).reward for name, judge in judges.items()}
+    row = {
+        "running": ~(now.over | following.lost),
+        "kept": jax.vmap(keep)(now.env),
+        "action": action,
+        "reward": following.env.reward,
+        "metrics": following.env.metrics,
+        "judged": judged,
+    }
+    return Playing(following, plans), row
+
+
+def episodes(
+    config: Config,
+    settings: Settings,
+    env: Env,
+    make_guide: Callable[[Any], Guide],
+    learned: Any,
+    seed: int,
+    number: int,
+    judges: Mapping[str, Env] | None = None,
+    keep: Callable[[State], Any] = lambda state: (),
+) -> Iterator[tuple[Playing, dict[str, Any]]]:
+    """Plays E whole episodes; yields them and numpy arrays [T, E, ...] after every few steps.
+
+    Two programs are compiled: the beginning, and `CHUNK` control steps, each with its plan.
+
+    Args:
+      config: for the time limit.
+      settings: of the planner.
+      env: the environment.
+      make_guide: makes the guide, in the program, of `learned`.
+      learned: arrays.
+      seed: of the episodes and plans.
+      number: E.
+      judges: see `advance`.
+      keep: see `advance`.
+    """
+    others = judges or {}
+
+    def first(learned: Any, key: Array) -> Playing:
+        return begin(config, settings, env, make_guide(learned), key, number)
+
+    def chunk(learned: Any, key: Array, playing: Playing) -> tuple[Playing, dict[str, Any]]:
+        step = functools.partial(advance, settings, env, others, keep, make_guide(learned), key)
+        return jax.lax.scan(lambda now, _: step(now), playing, length=CHUNK)
+
+    # As `evaluation.evaluate` does: the same beginnings.
+    reset_key, key = jax.random.split(derive(jax.random.key(seed), Purpose.EVALUATION))
+    playing, go_on = jit("plan_start", first)(learned, reset_key), jit("plan", chunk)
+    while True:
+        playing, rows = go_on(learned, key, playing)
+        yield playing, jax.device_get(rows)
+        if bool(np.all(playing.progress.over)):
+            return
+
+
+def results(playing: Playing) -> dict[str, np.ndarray]:
+    """Returns the figures of episodes that are over, name -> [E], as `evaluation.evaluate` does."""
+    progress = playing.progress
+    found = rollout.episode_metrics(progress.episode) | {
+        "episode_return": progress.episode.episode_return,
+        "episode_length": progress.episode.length.astype(jnp.float32),
+        "lost": progress.lost.astype(jnp.float32),
+    }
+    return {name: np.asarray(x, float) for name, x in found.items()}

@@ -1,0 +1,185 @@
+"""The points of a sweep: settings as words of `python -m purerl.run`, checked before it begins."""
+
+import dataclasses
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import tyro
+
+from purerl.core.errors import UserError, nearest, one_line
+from purerl.runs import experiment
+from purerl.runs.command_line import WORDS, parse
+from purerl.runs.experiment import Experiment
+from purerl.runs.kinds import hints
+from purerl.runs.options import Options
+from purerl.tune.sweep.scheduler import Job
+from purerl.tune.sweep.spaces import Space, Values, parse_space
+
+
+class Point(NamedTuple):
+    """Settings that are trained with several seeds."""
+
+    number: int
+    values: Values
+
+    @property
+    def name(self) -> str:
+        """The name of its runs."""
+        return f"p{self.number:04d}"
+
+
+class Base(NamedTuple):
+    """What all points have in common."""
+
+    experiment: str  # as the user named it
+    name: str  # of the experiment
+    chosen: Experiment  # with the settings that all points share
+    words: tuple[str, ...]  # of the run command, those of the points excepted
+    seeds: int
+    folder: Path  # of the sweep
+
+
+def read_spaces(base: Base, texts: Iterable[str], given: Sequence[str]) -> list[Space]:
+    """Reads `SETTING=VALUES` texts.
+
+    Args:
+      base: the experiment whose settings they are.
+      texts: of the command line.
+      given: options that all points share.
+
+    Raises:
+      UserError: there is no such setting, it comes twice, or a value is of the wrong type.
+    """
+    found: dict[str, Space] = {}
+    for text in texts:
+        name, equals, values = text.partition("=")
+        name = name.strip().removeprefix("--").replace("_", "-")
+        if not equals:
+            raise UserError(f"{text!r} names no values; give it as SETTING=1,2,3.")
+        default = setting(base, name)
+        if name in found or f"--{name}" in given:
+            raise UserError(f"The setting {name} is given twice; leave one out.")
+        whole = isinstance(default, int) and not isinstance(default, bool)
+        found[name] = space = parse_space(name, values.strip(), whole)
+        typed = [read_value(base, name, end) for end in space.ends]
+        if twice := [end for i, end in enumerate(space.ends) if typed[i] in typed[:i]]:
+            raise UserError(f"{name} has the value {twice[0]} twice; leave one out.")
+    if not found:
+        raise UserError("Nothing is swept; give --grid SETTING=1,2,3, or --over with --random.")
+    return list(found.values())
+
+
+def setting(base: Base, name: str) -> Any:
+    """Returns the value of a setting; UserError with the nearest name if there is none."""
+    if name == "seed":
+        raise UserError("Each point is trained with several seeds already: give --seeds 3.")
+    names = _names(base.chosen)
+    if name not in names:
+        near = nearest(name, names)
+        hint = f" Did you mean {near}?" if near else ""
+        page = f"python -m purerl.run {base.experiment} --help"
+        raise UserError(f"There is no setting {name!r}.{hint} All settings: {page}")
+    return names[name]
+
+
+def _names(value: Any, path: str = "") -> dict[str, Any]:
+    """Returns the settings of an experiment, `ppo.learning-rate` -> value."""
+    found: dict[str, Any] = {}
+    for name, inner in experiment.settings(value).items():
+        name = path + name.replace("_", "-")
+        is_settings = dataclasses.is_dataclass(inner) and not isinstance(inner, type)
+        found |= _names(inner, f"{name}.") if is_settings else {name: inner}
+    return found
+
+
+def read_value(base: Base, name: str, text: str) -> Any:
+    """Returns a setting's value of the type that it has; UserError if it is of another."""
+    *path, last = name.replace("-", "_").split(".")
+    owner: Any = base.chosen
+    for part in path:
+        owner = getattr(owner, part)
+    kind = hints(type(owner)).get(last, type(getattr(owner, last)))
+    # A class with this setting alone: rules that join several settings come later, in `check`.
+    one: Any = Annotated[kind, tyro.conf.arg(name=name)]
+    alone = dataclasses.make_dataclass("Alone", [("value", one)], frozen=True)
+    words = [_bool_word(name, text)] if isinstance(getattr(owner, last), bool) else text.split()
+    prog = f"python -m purerl.run {base.experiment}"
+    return parse(alone, [f"--{name}", *words], prog, None, WORDS).value
+
+
+def _bool_word(name: str, text: str) -> str:
+    if text.lower() not in ("true", "false"):
+        raise UserError(f"{name} is {text}; it must be true or false.")
+    return text.capitalize()
+
+
+def check(base: Base, values: Values) -> Experiment:
+    """Returns the experiment of a point; UserError if its settings break a rule together."""
+    typed = {name: read_value(base, name, text) for name, text in values.items()}
+    return check_typed(base, values, typed)
+
+
+def check_all(base: Base, points: Sequence[Point]) -> None:
+    """Checks every point; each value is read once, since reading takes most of the time."""
+    pairs = {pair for point in points for pair in point.values.items()}
+    read = {pair: read_value(base, *pair) for pair in sorted(pairs)}
+    for point in points:
+        check_typed(base, point.values, {n: read[n, text] for n, text in point.values.items()})
+
+
+def check_typed(base: Base, values: Values, typed: Mapping[str, Any]) -> Experiment:
+    """Returns the experiment with a point's values; UserError if they break a rule together."""
+    tree: dict[str, Any] = {}
+    for name, value in typed.items():
+        *path, last = name.replace("-", "_").split(".")
+        place = tree
+        for part in path:
+            place = place.setdefault(part, {})
+        place[last] = value
+    try:
+        return _replace(base.chosen, tree)
+    except Exception as error:  # a rule of a dataclass, of ours or the user's
+        shown = " ".join(f"{name}={text}" for name, text in values.items())
+        raise UserError(f"The point {shown}: {one_line(error)}") from error
+
+
+def _replace(value: Any, tree: Mapping[str, Any]) -> Any:
+    """Returns a dataclass's value with new fields, at any depth, each made only once."""
+    changed = {
+        name: _replace(getattr(value, name), new) if isinstance(new, dict) else new
+        for name, new in tree.items()
+    }
+    return dataclasses.replace(value, **changed)
+
+
+def option_words(base: Base, name: str, text: str) -> list[str]:
+    """Returns a setting with its value, as words of the run command: a flag has no value."""
+    default = _names(base.chosen).get(name, getattr(Options, name.replace("-", "_"), None))
+    if not isinstance(default, bool):
+        return [f"--{name}", *text.split()]
+    if (_bool_word(name, text) == "True") == default:
+        return []
+    *path, last = name.split(".")
+    return [f"--{'.'.join([*path, f'no-{last}' if default else last])}"]
+
+
+def job(base: Base, point: Point) -> Job:
+    """Returns a point as what is to be run: all its seeds in one process."""
+    words = [base.experiment, *base.words]
+    for name, text in point.values.items():
+        words += option_words(base, name, text)
+    words += ["--runs", str(base.folder), "--name", point.name]
+    names = [point.name]
+    if base.seeds > 1:
+        words += ["--num-seeds", str(base.seeds)]
+        first = base.chosen.seed
+        names = [f"{point.name}-seed{first + i}" for i in range(base.seeds)]
+    folders = tuple(base.folder / base.name / name for name in names)
+    return Job(point.name, tuple(words), folders, base.folder / "logs" / f"{point.name}.log")
+
+
+def command(one: Job) -> str:
+    """Returns a job as a line for a shell."""
+    return shlex.join(["python", "-m", "purerl.run", *one.words])

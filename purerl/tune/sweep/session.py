@@ -1,0 +1,200 @@
+"""Carries a sweep out: its folder, its runs, its table."""
+
+import contextlib
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, UserError
+from purerl.runs import manifest
+from purerl.runs.experiment import to_json
+from purerl.runs.files import make_folder, read_json, write_json
+from purerl.runs.lock import RunLock
+from purerl.runs.output import say, show, warn
+from purerl.tune.sweep import picture, points, scheduler, slurm, spaces, study, table
+from purerl.tune.sweep.options import Options, read
+from purerl.tune.sweep.points import Base, Point
+from purerl.tune.sweep.scheduler import Ended, Job
+from purerl.tune.sweep.spaces import Space
+
+
+class Sweep(NamedTuple):
+    """A sweep that has been checked."""
+
+    options: Options
+    base: Base
+    spaces: list[Space]
+    points: list[Point]  # empty if Optuna chooses them
+
+
+def execute(arguments: Sequence[str]) -> int:
+    """Checks the whole command, then carries it out; returns the exit code."""
+    options, base, given = read(arguments)
+    swept = points.read_spaces(base, options.grid or options.over, given)
+    sweep = Sweep(options, base, swept, [])
+    if options.optuna:
+        spaces.check_number("optuna", options.optuna)
+        study.check_installed("optuna")
+    else:
+        drawn = spaces.draw(swept, options.random) if options.random else spaces.grid(swept)
+        sweep.points.extend(Point(number, values) for number, values in enumerate(drawn))
+        points.check_all(base, sweep.points)
+    if options.slurm:
+        study.check_installed("submitit")
+        slurm.check(options.slurm)
+    if options.dry_run:
+        return _show_commands(sweep)
+    with _begin(sweep):
+        return _submit(sweep) if options.slurm else _carry_out(sweep)
+
+
+def _show_commands(sweep: Sweep) -> int:
+    shown = sweep.points
+    if sweep.options.optuna:
+        first = study.propose(study.open_study(None), sweep.spaces, sweep.options.optuna)
+        shown = list(itertools.islice(first, study.FIRST))
+    show(*(points.command(points.job(sweep.base, point)) for point in shown))
+    if sweep.options.optuna > len(shown):
+        show(f"# The other {sweep.options.optuna - len(shown)} points depend on scores.")
+    return SUCCESS
+
+
+# --- the folder ---
+
+
+@contextlib.contextmanager
+def _begin(sweep: Sweep) -> Iterator[None]:
+    """Makes the sweep's folder and locks it; UserError if it holds another sweep."""
+    folder = sweep.base.folder
+    file = folder / "sweep.json"
+    try:
+        make_folder(folder)
+        if not file.exists() and any(not one.name.startswith(".") for one in folder.iterdir()):
+            raise UserError(f"{folder} holds no sweep, but other files; use another --name.")
+        lock = RunLock(folder)
+    except OSError as error:
+        raise UserError(f"{folder} cannot be written: {error.strerror}.") from error
+    except UserError as error:
+        if "process" not in str(error):
+            raise
+        raise UserError(
+            f"The sweep {folder} is being carried out by another process; stop that one first, or "
+            "use another --name."
+        ) from error
+    try:
+        described = _describe(sweep)
+        found = manifest.differences(read_json(file), described) if file.exists() else []
+        if found:
+            more = f" (and {len(found) - 1} more)" if found[1:] else ""
+            raise UserError(
+                f"The sweep {folder} was begun otherwise: {found[0]}{more}; give the command it "
+                "was begun with, or another --name."
+            )
+        write_json(file, described)
+        yield
+    finally:
+        lock.close()
+
+
+def _describe(sweep: Sweep) -> dict[str, object]:
+    """Returns what makes a sweep another one; of drawn points their number does not."""
+    options, base = sweep.options, sweep.base
+    values = {
+        space.setting: spaces.as_json(
+            space, lambda text, name=space.setting: to_json(points.read_value(base, name, text))
+        )
+        for space in sweep.spaces
+    }
+    how = "random" if options.random else "optuna" if options.optuna else "grid"
+    found = {"experiment": base.name, "settings": to_json(base.chosen), "swept": values}
+    found |= {"points": how, "seeds": options.seeds}
+    return found | ({"metric": options.metric} if options.optuna else {})
+
+
+# --- carrying out ---
+
+
+class _Progress:
+    """Tells of each job, and tells Optuna its score."""
+
+    def __init__(self, sweep: Sweep) -> None:
+        self.sweep = sweep
+        self.points = {point.name: point for point in sweep.points}
+        self.number = sweep.options.optuna or len(sweep.points)
+        self.study = study.open_study(sweep.base.folder) if sweep.options.optuna else None
+        if self.study is not None:
+            known = study.known(self.study, sweep.spaces)
+            self.points = {point.name: point for point in known}
+        self.results: list[Ended] = []
+
+    def jobs(self) -> Iterator[Job]:
+        """Yields what is to be run; Optuna chooses when it is asked for."""
+        chosen: Iterator[Point] = iter(self.sweep.points)
+        if self.study is not None:
+            chosen = study.propose(self.study, self.sweep.spaces, self.sweep.options.optuna)
+        for point in chosen:
+            self.points[point.name] = point
+            yield points.job(self.sweep.base, point)
+
+    def began(self, job: Job) -> None:
+        say(f"{job.name}  begins   {self._values(job)}")
+
+    def ended(self, result: Ended) -> None:
+        """Tells how a job ended; UserError if it is done and has no such metric."""
+        self.results.append(result)
+        point, metric, score = self.points[result.job.name], self.sweep.options.metric, None
+        if result.status == "done":
+            table.check_metric(self.sweep.base, point, metric)
+            group = table.group_of(self.sweep.base, point)
+            score = table.summarize(group, metric)["iqm"]
+        if self.study is not None and result.status != "stopped":
+            study.tell(self.study, point, score)
+        shown = f": {result.said}" if score is None and result.said else ""
+        shown = f": {score:.6g}" if score is not None else shown
+        count = f"{len(self.results)} of {self.number}"
+        say(f"{point.name}  {result.status:8} {self._values(result.job)}{shown}  ({count})")
+
+    def _values(self, job: Job) -> str:
+        return " ".join(f"{n}={v}" for n, v in self.points[job.name].values.items())
+
+
+def _carry_out(sweep: Sweep) -> int:
+    """Runs all points here, then makes the table; returns the exit code."""
+    gpus = scheduler.find_gpus()
+    at_once = sweep.options.jobs or scheduler.jobs_at_once(gpus)
+    progress = _Progress(sweep)
+    place = f"{len(gpus)} GPUs" if gpus else "the CPU"
+    say(f"sweep        {sweep.base.folder}: {progress.number} points of {sweep.base.seeds} seeds, "
+        f"{at_once} at once on {place}")  # fmt: skip
+    asked = scheduler.carry_out(progress.jobs(), at_once, gpus, progress.began, progress.ended)
+    status = {row.status for row in _report(sweep, list(progress.points.values()))}
+    if asked or status & {"stopped", "training", "waiting"}:
+        warn("Stopped; the same command goes on.")
+        return INTERRUPTED
+    return FAILURE if "failed" in status else SUCCESS
+
+
+def _submit(sweep: Sweep) -> int:
+    """Submits what is not done to SLURM, and makes the table of what there is."""
+    jobs = [points.job(sweep.base, point) for point in sweep.points]
+    options = sweep.options
+    names, queued = slurm.submit(jobs, sweep.base.folder, options.slurm, options.jobs)
+    say(f"sweep        {sweep.base.folder}: {len(names)} of {len(jobs)} points submitted, "
+        f"{queued} in the queue or training")  # fmt: skip
+    if names or queued:
+        say("The same command tells how far they are, and submits again what was stopped.")
+    _report(sweep, sweep.points)
+    return SUCCESS
+
+
+def _report(sweep: Sweep, chosen: Sequence[Point]) -> list[table.Row]:
+    """Prints the table, and writes it and the picture; returns its rows."""
+    metric, folder = sweep.options.metric, sweep.base.folder
+    rows = table.make_rows(sweep.base, chosen, metric)
+    lines = table.describe(rows, sweep.spaces, metric)
+    files = list(table.write(folder, rows, sweep.spaces, lines).values())
+    drawn = folder / "sweep.png"
+    if picture.draw(drawn, rows, sweep.spaces, metric):
+        files.append(drawn)
+    show(*lines, *map(str, files))
+    return rows

@@ -1,0 +1,94 @@
+"""Points that Optuna chooses by the scores so far; its own storage keeps them in the folder."""
+
+import importlib.util
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from purerl.core.errors import UserError
+from purerl.tune.sweep.points import Point
+from purerl.tune.sweep.spaces import Space
+
+FILE = "optuna.db"
+FIRST = 10  # points that Optuna's sampler draws before it looks at scores
+
+
+def check_installed(package: str) -> None:
+    """Raises UserError, with the line to paste, unless a package of the extra is there."""
+    if importlib.util.find_spec(package) is None:
+        raise UserError(f"The package {package} is not installed; run: pip install 'purerl[sweep]'")
+
+
+def open_study(folder: Path | None) -> Any:
+    """Opens the study of a sweep's folder, or one that nobody keeps (None)."""
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    warnings.filterwarnings("ignore", category=UserWarning, module="optuna")
+    storage = f"sqlite:///{folder / FILE}" if folder else None
+    return optuna.create_study(
+        study_name="sweep", storage=storage, direction="maximize", load_if_exists=True
+    )
+
+
+def known(study: Any, spaces: Sequence[Space]) -> list[Point]:
+    """Returns the points chosen so far; one that a kill left half chosen is none."""
+    names = {space.setting for space in spaces}
+    return [
+        Point(trial.number, {space.setting: _text(space, trial.params) for space in spaces})
+        for trial in study.get_trials(deepcopy=False)
+        if names == trial.params.keys()
+    ]
+
+
+def propose(study: Any, spaces: Sequence[Space], number: int) -> Iterator[Point]:
+    """Yields the points without a score, then new ones until there are `number`."""
+    open_ones = {t.number for t in study.get_trials(deepcopy=False) if not t.state.is_finished()}
+    yield from (point for point in known(study, spaces) if point.number in open_ones)
+    while len(known(study, spaces)) < number:
+        study.sampler = _sampler(len(study.get_trials(deepcopy=False)))
+        trial = study.ask(_distributions(spaces))
+        yield Point(trial.number, {s.setting: _text(s, trial.params) for s in spaces})
+
+
+def tell(study: Any, point: Point, score: float | None) -> None:
+    """Notes a point's score; None: it failed."""
+    from optuna.trial import TrialState
+
+    if study.get_trials(deepcopy=False)[point.number].state.is_finished():
+        return
+    if score is None:
+        study.tell(point.number, state=TrialState.FAIL)
+    else:
+        study.tell(point.number, score)
+
+
+def _sampler(seed: int) -> Any:
+    """Returns a sampler of one point: a sweep that goes on draws what it would have drawn."""
+    from optuna.samplers import TPESampler
+
+    return TPESampler(seed=seed, n_startup_trials=FIRST)
+
+
+def _distributions(spaces: Sequence[Space]) -> dict[str, Any]:
+    from optuna.distributions import (
+        CategoricalDistribution,
+        FloatDistribution,
+        IntDistribution,
+    )
+
+    found: dict[str, Any] = {}
+    for space in spaces:
+        if space.choices:
+            found[space.setting] = CategoricalDistribution(space.choices)
+        elif space.whole:
+            ends = round(space.low), round(space.high)
+            found[space.setting] = IntDistribution(*ends, log=space.log)
+        else:
+            found[space.setting] = FloatDistribution(space.low, space.high, log=space.log)
+    return found
+
+
+def _text(space: Space, params: dict[str, Any]) -> str:
+    return str(params[space.setting])  # of a float every digit

@@ -1,0 +1,160 @@
+"""The window's clock: plays the session in real time, and has slow work done beside it."""
+
+import socket
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+from purerl.core.errors import RunError, UserError, one_line
+from purerl.runs.user_code import running
+from purerl.tune.view import session as events
+from purerl.tune.view.opening import Source
+from purerl.tune.view.option_numbers import label
+from purerl.tune.view.session import Session, advance, to_build
+
+if TYPE_CHECKING:
+    from purerl.tune.view.page import Page
+
+FRAME = 1 / 60  # the least time between two frames [s]
+LONGEST = 1 / 25  # what is played between two frames, so that slow plans show too [s]
+SAY = 0.2  # between two changes of numbers and plots [s]
+CAME, LEFT = "A browser shows it.", "The last browser left: paused until one opens the page."
+LOOK = 2.0  # between two looks for new checkpoints [s]
+
+
+def check_port(host: str, port: int) -> None:
+    """Raises UserError unless the port can be listened on."""
+    try:
+        with socket.socket() as one:
+            one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            one.bind((host, port))
+    except (OSError, OverflowError) as error:
+        why = getattr(error, "strerror", None) or one_line(error)
+        raise UserError(
+            f"{host}:{port} cannot be listened on ({why}): give another, as "
+            f"--port {port % 60000 + 1}."
+        ) from error
+
+
+class Beside:
+    """Slow work in a thread of its own, one piece at a time; it returns an event."""
+
+    def __init__(self) -> None:
+        """Starts the thread when there is work."""
+        self.pool = ThreadPoolExecutor(1, "purerl-view")
+        self.work: Future[Any] | None = None
+        self.what, self.since = "", 0.0
+
+    def begin(self, what: str, function: Callable[..., Any], *arguments: Any) -> None:
+        """Begins a piece of work, called `what`."""
+        self.what, self.since = what, time.perf_counter()
+        self.work = self.pool.submit(_told, function, *arguments)
+
+    def finished(self) -> list[Any]:
+        """Returns the event of the work that has been done since the last call, or none."""
+        if self.work is None or not self.work.done():
+            return []
+        done, self.work, self.what = self.work, None, ""
+        return [done.result()]
+
+    @property
+    def words(self) -> str:
+        """What it does, and for how long; "" if nothing."""
+        return f"{self.what} ({time.perf_counter() - self.since:.0f} s)" if self.what else ""
+
+
+def _told(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Returns the event that work returned, or one that says why it failed."""
+    try:
+        return function(*arguments)
+    except Exception as error:  # a program, a file: whatever goes wrong is said in the page
+        return events.Failed(one_line(error))
+
+
+def begin_work(session: Session, source: Source, beside: Beside) -> None:
+    """Begins what the session waits for, unless something is being done."""
+    if beside.work is not None:
+        return
+    if session.chosen:
+        what = f"reading checkpoint {session.chosen}"
+        beside.begin(what, lambda name: events.Loaded(*source.brain(name)), session.chosen)
+    elif numbers := to_build(session):
+        fixed = session.program.fixed
+        changed = [f"{label(p)} = {numbers[p]:g}" for p in fixed if numbers[p] != fixed[p]]
+        what = f"compiling with {', '.join(changed)}"
+        beside.begin(what, lambda values: events.Built(source.program(values)), dict(numbers))
+
+
+class Pace:
+    """Counts frames and simulated time against the clock."""
+
+    def __init__(self) -> None:
+        """Begins to count."""
+        self.since, self.frames, self.steps, self.said = time.perf_counter(), 0, 0, ""
+
+    def count(self, frames: int, steps: int) -> None:
+        """Counts frames drawn and control steps taken."""
+        self.frames, self.steps = self.frames + frames, self.steps + steps
+
+    def words(self, timestep: float) -> str:
+        """Returns how fast it goes, over the last second; `timestep` of control [s]."""
+        seconds = time.perf_counter() - self.since
+        if seconds > 1.0:
+            self.said = (
+                f"{self.steps * timestep / seconds:.2f} x real time, "
+                f"{self.frames / seconds:.0f} frames/s"
+            )
+            self.since, self.frames, self.steps = time.perf_counter(), 0, 0
+        return self.said
+
+
+def play(
+    page: "Page", session: Session, source: Source, say: Callable[[str], None],
+    stop: Callable[[], bool] = lambda: False,
+) -> Session:  # fmt: skip
+    """Plays a session until `stop()`, or Ctrl-C; returns it.
+
+    Nothing moves while no browser shows the page. `say` is told when one comes or leaves.
+    """
+    beside, pace = Beside(), Pace()
+    page.build(session, source.checkpoints())
+    page.on_train(lambda: source.command(page.numbers))
+    page.scene.show(session)
+    last = said = looked = time.perf_counter()
+    watched = False
+    while not stop():
+        if page.watched != watched:
+            watched = page.watched
+            say(CAME if watched else LEFT)
+        now = time.perf_counter()
+        tick = [events.Tick(min(now - last, LONGEST))] if watched else []
+        before, last = session, now
+        session, failed = _advance(session, [*page.happened(), *beside.finished(), *tick])
+        if failed:
+            page.set_sliders(session.numbers)
+        begin_work(session, source, beside)
+        if session.program is not before.program:
+            page.scene.show(session)
+        elif session.picture is not before.picture:
+            page.scene.draw(session)
+            pace.count(1, max(1, session.length - before.length))
+        if now - said > SAY:
+            said, timestep = now, session.program.env.control_timestep
+            doing = beside.words or pace.words(timestep)
+            page.say(session, doing, source.words(session.numbers))
+        if now - looked > LOOK and page.checkpoints is not None:
+            looked = now
+            page.offer_checkpoints(source.checkpoints())
+        time.sleep(max(0.0, FRAME - (time.perf_counter() - now)) if watched else 0.05)
+    return session
+
+
+def _advance(session: Session, happened: list[Any]) -> tuple[Session, bool]:
+    """Returns the session after the events, and whether something failed."""
+    failed = any(isinstance(event, events.Failed) for event in happened)
+    try:
+        with running():
+            return advance(session, happened), failed
+    except (RunError, UserError) as error:  # a function of the environment raised
+        return session._replace(playing=False, trouble=str(error), grip=None), failed

@@ -1,0 +1,156 @@
+"""What a window begins with, and where it gets the rest; a run is only read."""
+
+import functools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+
+from purerl.core.errors import UserError, one_line
+from purerl.core.records import TrainState
+from purerl.devices.compilation import set_up_jax
+from purerl.runs import checkpoint_folder, experiment, files
+from purerl.runs.build_experiment import Setup, build
+from purerl.runs.experiment import Experiment
+from purerl.runs.loaded_run import Run, load
+from purerl.runs.output import show
+from purerl.runs.restored_run import read_checkpoint
+from purerl.tune.plan import planner
+from purerl.tune.view import overrides
+from purerl.tune.view.drivers import Driver, planner_driver, policy_driver
+from purerl.tune.view.option_numbers import replaced
+from purerl.tune.view.program import Numbers, build_program
+from purerl.tune.view.session import Session, open_session
+
+
+class Source(NamedTuple):
+    """Where sessions get what takes time, and words.
+
+    `program(numbers) -> Program` and `brain(name) -> (brain, words)` raise UserError;
+    `checkpoints() -> names`; `words(numbers) -> overrides`; `command(numbers) -> command line`.
+    """
+
+    program: Callable[[Numbers], Any]
+    brain: Callable[[str], tuple[Any, str]]
+    checkpoints: Callable[[], Sequence[str]]
+    words: Callable[[Numbers], str]
+    command: Callable[[Numbers], str]
+
+
+def open_window(options: Any) -> tuple[Session, Source, str]:
+    """Reads a run or an experiment, as the command's options name it.
+
+    Returns:
+      The session at its start, the source of the rest, and the page's title.
+
+    Raises:
+      UserError: it is neither, or its environment cannot be drawn.
+    """
+    return (_of_run if options.run.is_dir() else _of_experiment)(options)
+
+
+def _of_run(options: Any) -> tuple[Session, Source, str]:
+    run = load(options.run, options.checkpoint, options.engine, options.trust)
+    setup, brain = run.restored.setup, jax.device_put(run.state)
+    guide = functools.partial(planner.guide, setup.config, setup.network)
+    if options.drive == "planner":
+        driver = planner_driver(options, guide, brain)
+    else:
+        driver = policy_driver(guide, brain)
+
+    def other_brain(name: str) -> tuple[TrainState, str]:
+        saved = read_checkpoint(run.folder, name, setup, show)
+        return jax.device_put(saved.state), _words(saved.meta["update"], saved.meta["steps"])
+
+    written = run.restored.source.experiment
+    source = _source(setup, driver, brain, written, run.experiment, command_name(run))
+    source = source._replace(
+        brain=other_brain,
+        checkpoints=lambda: checkpoint_names(run.folder, options.checkpoint),
+    )
+    words = _words(run.update, run.steps)
+    title = f"{run.folder.absolute().parent.name}/{run.folder.absolute().name}"
+    return _open(source, setup, brain, words, options), source, title
+
+
+def _of_experiment(options: Any) -> tuple[Session, Source, str]:
+    if options.drive == "policy":
+        raise UserError(f"{options.run} is no run's folder: an experiment has no policy to drive.")
+    set_up_jax(cache=True)
+    found = experiment.find_source(str(options.run))
+    setup, name = build(found.experiment), str(options.run)
+    driver = planner_driver(options, lambda _: planner.unguided(setup.env.action_size), ())
+    source = _source(setup, driver, (), found.experiment, found.experiment, name)
+    return _open(source, setup, (), _plans(options), options), source, found.name
+
+
+def _source(
+    setup: Setup, driver: Driver, brain: Any, written: Experiment, chosen: Experiment, name: str
+) -> Source:
+    """Returns the source of programs and words, without checkpoints.
+
+    Args:
+      setup: the experiment's objects.
+      driver: who drives.
+      brain: for its shapes.
+      written: the experiment as its file has it.
+      chosen: with the run's settings.
+      name: that `python -m purerl.run` knows it by.
+    """
+    observed = jax.eval_shape(setup.env.reset, jax.random.key(0)).observation
+
+    def program(numbers: Numbers) -> Any:
+        changed = replaced(chosen.env, numbers)
+        known = observed if jax.tree.leaves(brain) else None
+        return build_program(chosen.build_env, changed, setup.engine, driver, brain, known)
+
+    def words(numbers: Numbers) -> str:
+        try:
+            return " ".join(overrides.environment_words(written, replaced(chosen.env, numbers)))
+        except Exception as error:  # a rule of the options, until the sliders are taken back
+            return one_line(error)
+
+    def command(numbers: Numbers) -> str:
+        try:
+            changed = replaced(chosen.env, numbers)
+            return overrides.train_command(name, written, chosen, changed)
+        except Exception as error:
+            return one_line(error)
+
+    return Source(program, _no_brain, tuple, words, command)
+
+
+def _no_brain(name: str) -> tuple[Any, str]:
+    raise UserError(f"There is no checkpoint {name}: nothing was trained.")
+
+
+def _open(source: Source, setup: Setup, brain: Any, words: str, options: Any) -> Session:
+    limit = setup.config.episode_length
+    return open_session(source.program({}), brain, words, limit, options.seed)
+
+
+def _words(update: int, steps: int) -> str:
+    return f"policy of update {update:,} ({steps:,} steps)"
+
+
+def _plans(options: Any) -> str:
+    return f"{options.planner}, {options.samples} plans of {options.horizon} steps"
+
+
+def checkpoint_names(folder: Path, first: str) -> list[str]:
+    """Returns the checkpoints that can be chosen now, the newest first after `first`."""
+    try:
+        updates = checkpoint_folder.updates(folder / "checkpoints")
+    except OSError:  # it may be moved, or a disk away for a moment
+        updates = []
+    return list(dict.fromkeys([first, "latest", "best", *map(str, reversed(updates))]))
+
+
+def command_name(run: Run) -> str:
+    """Returns what `python -m purerl.run` knows the run's experiment by."""
+    name = files.read_json(run.folder / "config.json")["experiment"]
+    if name in experiment.available():
+        return name
+    place = Path(files.read_json(run.folder / "manifest.json").get("experiment_file", ""))
+    return str(place if place.is_file() else run.folder / "experiment.py")

@@ -1,0 +1,212 @@
+"""The page in the browser, by viser: its controls, plots and tables; `scene.py` draws the body.
+
+What a person does there becomes events of `session.py` in a queue. What the session says is shown.
+"""
+
+import contextlib
+import io
+import queue
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import viser
+
+from purerl.tune.view import readouts, session as events
+from purerl.tune.view.option_numbers import Place, bounds, label
+from purerl.tune.view.scene import Scene
+from purerl.tune.view.session import Session
+
+SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
+MOVES = {"Step": events.Step, "Next episode": events.Next}
+WAYS = {"forward": (1, 0, 0), "back": (-1, 0, 0), "left": (0, 1, 0), "right": (0, -1, 0),
+        "up": (0, 0, 1)}  # fmt: skip
+COLORS = ("#222222", "#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b")
+PLOTS = {
+    "Reward per step": readouts.reward_plot,
+    "Value": readouts.value_plot,
+    "Actions": readouts.action_plot,
+}
+PLOT_HEIGHT, PANEL_WIDTH = 190, 380  # [pixels]
+
+
+class Page:
+    """One page, which any number of browsers show."""
+
+    def __init__(self, host: str, port: int, title: str) -> None:
+        """Opens the page's server; port 0 is any free one."""
+        self.events: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
+            self.server = viser.ViserServer(host, port, label=title, verbose=False)
+        self.server.gui.configure_theme(show_share_button=False, control_width="large")
+        self.scene = Scene(self.server, self.events.put)
+        self.sliders: dict[Place, Any] = {}
+        self.numbers: dict[Place, Any] = {}  # as the sliders have told them
+        self.plots: dict[str, Any] = {}
+        self.names: dict[str, tuple[str, ...]] = {}  # of each plot's lines
+        self.checkpoints: Any = None
+
+    @property
+    def port(self) -> int:
+        """Where it listens."""
+        return self.server.get_port()
+
+    @property
+    def watched(self) -> bool:
+        """Whether a browser shows it."""
+        return bool(self.server.get_clients())
+
+    def close(self) -> None:
+        """Ends the server."""
+        self.server.stop()
+
+    def happened(self) -> list[Any]:
+        """Returns the events since the last call."""
+        return [self.events.get() for _ in range(self.events.qsize())]
+
+    def build(self, session: Session, checkpoints: Sequence[str]) -> None:
+        """Adds everything that a person moves and reads.
+
+        Args:
+          session: the session.
+          checkpoints: names to choose among, the first being in use; none: nothing to choose.
+        """
+        gui, put = self.server.gui, self.events.put
+        self.status, self.trouble = gui.add_markdown("opening"), gui.add_markdown("")
+        self.play = gui.add_button("Pause")
+        self.play.on_click(lambda _: put(events.Play(self.play.label == "Play")))
+        moves = gui.add_button_group("Move on", tuple(MOVES))
+        moves.on_click(lambda _: put(MOVES[moves.value]()))
+        speed = gui.add_dropdown(
+            "Speed", SPEEDS, initial_value="1", hint="Simulated seconds in a real one"
+        )
+        speed.on_update(lambda _: put(events.Speed(float(speed.value))))
+        follow = gui.add_checkbox("Camera follows", True)
+        follow.on_update(lambda _: setattr(self.scene, "follows", follow.value))
+        seed = gui.add_number("Seed", session.seed, min=0, max=2**32 - 1, step=1)
+        seed.on_update(lambda _: put(events.Seed(int(seed.value))))
+        if checkpoints:
+            self.checkpoints = gui.add_dropdown(
+                "Checkpoint", tuple(checkpoints), initial_value=checkpoints[0]
+            )
+            self.checkpoints.on_update(lambda _: put(events.Choose(self.checkpoints.value)))
+        self._add_sliders(session)
+        self._add_push()
+        self._add_plots()
+
+    def _add_push(self) -> None:
+        gui = self.server.gui
+        with gui.add_folder("Push (or drag the body with the mouse)"):
+            way = gui.add_dropdown("Direction", tuple(WAYS), initial_value="left")
+            hard = gui.add_slider("Strength [m/s]", 0.1, 5.0, 0.1, 1.0)
+
+            @gui.add_button("Push").on_click
+            def _(_: Any) -> None:
+                x, y, z = (hard.value * part for part in WAYS[way.value])
+                self.events.put(events.Push((x, y, z)))
+
+    def _add_sliders(self, session: Session) -> None:
+        gui, live = self.server.gui, session.program.live
+        with gui.add_folder("Options of the environment"):
+            self.words = gui.add_markdown("This environment's options have no numbers.")
+            self.train = gui.add_button("Train this", hint="Shows the command that trains it")
+            self.command = gui.add_markdown("", visible=False)
+            for place in live:
+                self._add_slider(place, session.numbers[place], "acts at once")
+        others = [place for place in session.numbers if place not in live]
+        if others:
+            with gui.add_folder("Options that build the environment anew"):
+                for place in others:
+                    self._add_slider(place, session.numbers[place], "takes seconds; a new episode")
+
+    def _add_slider(self, place: Place, value: Any, hint: str) -> None:
+        least, greatest, step = bounds(value)
+        slider = self.server.gui.add_slider(
+            label(place), min=least, max=greatest, step=step, initial_value=value, hint=hint
+        )
+        slider.on_update(lambda _: self._slid(place, slider.value))
+        self.sliders[place], self.numbers[place] = slider, value
+
+    def _slid(self, place: Place, value: float) -> None:
+        """Tells a slider's move, but for one that `set_sliders` made."""
+        if value != self.numbers[place]:
+            self.numbers[place] = value
+            self.events.put(events.Slide(place, value))
+
+    def _add_plots(self) -> None:
+        panel = self.server.gui.add_panel()
+        self.tab = panel.add_tab("Live")
+        with self.tab:
+            self.table = self.server.gui.add_html("")
+        self.server.gui.main_panel.dock_right()
+        panel.dock_left()
+        panel.set_width(PANEL_WIDTH)
+
+    def on_train(self, command: Callable[[], str]) -> None:
+        """Shows a command when it is asked for."""
+
+        @self.train.on_click
+        def _(_: Any) -> None:
+            self.command.content, self.command.visible = f"```bash\n{command()}\n```", True
+
+    def set_sliders(self, numbers: dict[Place, Any]) -> None:
+        """Sets the sliders back to the numbers that are in use."""
+        for place, slider in self.sliders.items():
+            if self.numbers[place] != numbers[place]:
+                self.numbers[place] = numbers[place]
+                slider.value = numbers[place]
+
+    def offer_checkpoints(self, names: Sequence[str]) -> None:
+        """Shows which checkpoints there are now; the chosen one stays."""
+        names = tuple(dict.fromkeys([*names, self.checkpoints.value]))
+        if names != tuple(self.checkpoints.options):
+            self.checkpoints.options = names
+
+    def say(self, session: Session, doing: str, words: str) -> None:
+        """Shows numbers, plots and lines.
+
+        Args:
+          session: the session.
+          doing: what is going on, such as how fast.
+          words: the overrides that make the sliders' setting.
+        """
+        self.play.label = "Pause" if session.playing else "Play"
+        _show(self.status, "  \n".join(readouts.status_lines(session, doing)))
+        _show(self.trouble, f"**{session.trouble}**" if session.trouble else "")
+        if self.sliders:
+            _show(self.words, f"```\n{words}\n```" if words else "As in the experiment's file.")
+        _show(self.table, readouts.reward_table(session))
+        self._draw_plots(session)
+
+    def _draw_plots(self, session: Session) -> None:
+        """Draws the lines; with fewer than two points uPlot has no scale, and they stay."""
+        for title, plot_of in PLOTS.items():
+            plot = plot_of(session)
+            if len(plot.columns[0]) < 2:
+                continue
+            if title in self.plots:
+                self.plots[title].data = plot.columns
+                if self.names[title] != plot.names:
+                    self.plots[title].series = _series(plot.names)
+            else:
+                with self.tab:
+                    self.plots[title] = self.server.gui.add_uplot(
+                        data=plot.columns, series=_series(plot.names), title=title,
+                        height=PLOT_HEIGHT, scales={"x": {"time": False}},
+                        legend={"show": len(plot.names) <= len(COLORS)},
+                    )  # fmt: skip
+            self.names[title] = plot.names
+
+
+def _series(names: Sequence[str]) -> tuple[Any, ...]:
+    """Returns how viser's plot is to draw the time and each line."""
+    lines = [
+        {"label": name, "stroke": COLORS[i % len(COLORS)], "width": 1.5}
+        for i, name in enumerate(names)
+    ]
+    return ({"label": "s"}, *lines)
+
+
+def _show(element: Any, content: str) -> None:
+    """Sets an element's text, if it is another."""
+    if element.content != content:
+        element.content = content

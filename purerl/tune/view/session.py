@@ -1,0 +1,299 @@
+"""What the window shows, as a record; `advance(session, events) -> session` is all that happens.
+
+The page and the clock make events. Nothing here waits, draws or reads a file.
+"""
+
+import functools
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from purerl.report.episode_pictures import Picture
+from purerl.report.renderer import root_body
+from purerl.tune.view import push
+from purerl.tune.view.option_numbers import Place
+from purerl.tune.view.program import Moment, Program, Shown, episode_key
+
+SECONDS_KEPT = 8.0  # of an episode, for the plots [s]
+MOST_ROWS = 800
+MOST_OWED = 0.1  # what a slow computer does not catch up on [s of the clock]
+INSTANT = 3  # episodes in a row of one step, after which the window stops
+
+
+class Row(NamedTuple):
+    """One control step, for plots and tables."""
+
+    time: float  # at its end [s]
+    reward: float
+    metrics: dict[str, float]
+    action: np.ndarray  # [A]
+    value: float
+
+
+class Session(NamedTuple):
+    """The window's state."""
+
+    program: Program
+    brain: Any
+    checkpoint: str  # what `brain` is, or who plans, in words
+    numbers: dict[Place, int | float]  # the sliders
+    limit: int  # control steps of an episode
+    seed: int
+    # The episode.
+    episode: int
+    moment: Moment
+    picture: Picture
+    rows: tuple[Row, ...] = ()  # the last SECONDS_KEPT
+    sums: dict[str, float] = {}  # of the reward and of each metric, over the episode
+    length: int = 0  # control steps
+    # The controls.
+    playing: bool = True
+    speed: float = 1.0
+    owed: float = 0.0  # simulated time that is still to be played [s]
+    grip: push.Grip | None = None
+    chosen: str = ""  # a checkpoint that has yet to be read
+    # What is said.
+    ended: str = ""  # how the last episode ended
+    trouble: str = ""
+    instant: int = 0  # episodes in a row that ended at once
+
+
+class Play(NamedTuple):
+    """Play, or pause."""
+
+    on: bool
+
+
+class Step(NamedTuple):
+    """One control step, and then a pause."""
+
+
+class Speed(NamedTuple):
+    """How many simulated seconds pass in one of the clock."""
+
+    factor: float
+
+
+class Next(NamedTuple):
+    """Start the next episode."""
+
+
+class Seed(NamedTuple):
+    """Start the first episode of another seed."""
+
+    seed: int
+
+
+class Choose(NamedTuple):
+    """Take another checkpoint: latest, best, or an update's number."""
+
+    name: str
+
+
+class Slide(NamedTuple):
+    """Another number in the options."""
+
+    place: Place
+    value: int | float
+
+
+class Push(NamedTuple):
+    """Change the velocity of the body's root."""
+
+    dv: tuple[float, float, float]  # [m/s]
+
+
+class Pull(NamedTuple):
+    """Hold a body at `start` and draw it to `target`, both in the world [m]."""
+
+    body: int
+    start: Any  # [3]
+    target: Any  # [3]
+
+
+class Release(NamedTuple):
+    """Let go."""
+
+
+class Tick(NamedTuple):
+    """So much time has passed on the clock [s]."""
+
+    seconds: float
+
+
+class Built(NamedTuple):
+    """A program for other numbers is ready."""
+
+    program: Program
+
+
+class Loaded(NamedTuple):
+    """A checkpoint has been read."""
+
+    brain: Any
+    checkpoint: str
+
+
+class Failed(NamedTuple):
+    """What was asked for could not be had, in one line."""
+
+    why: str
+
+
+def open_session(program: Program, brain: Any, checkpoint: str, limit: int, seed: int) -> Session:
+    """Returns a session at the start of a seed's first episode; `limit` in control steps."""
+    numbers = program.fixed | program.live
+    moment, picture = program.start(numbers, episode_key(seed, 0))
+    return Session(program, brain, checkpoint, numbers, limit, seed, 0, moment, picture)
+
+
+def to_build(session: Session) -> dict[Place, int | float] | None:
+    """Returns the numbers of which a program has to be built; None if the present one serves."""
+    fixed = session.program.fixed
+    wanted = {place: session.numbers[place] for place in fixed}
+    return None if wanted == fixed else session.numbers
+
+
+def advance(session: Session, events: Iterable[Any]) -> Session:
+    """Returns the session after these events, in order."""
+    return functools.reduce(_after, events, session)
+
+
+def _after(session: Session, event: Any) -> Session:
+    match event:
+        case Tick(seconds):
+            return _play(session, seconds) if session.playing else session
+        case Play(on):
+            return session._replace(playing=on, owed=0.0, instant=0, trouble="")
+        case Step():
+            return take_step(session._replace(playing=False, owed=0.0))
+        case Speed(factor):
+            return session._replace(speed=factor)
+        case Next():
+            return start_episode(session, session.episode + 1)
+        case Seed(seed):
+            return start_episode(session._replace(seed=seed), 0)
+        case Choose(name):
+            return session._replace(chosen=name)
+        case Slide(place, value):
+            return session._replace(numbers=session.numbers | {place: value}, trouble="")
+        case Push(dv):
+            return _pushed(session, dv)
+        case Pull():
+            return _held(session, event)
+        case Release():
+            return session._replace(grip=None)
+        case Built(program):
+            return start_episode(session._replace(program=program), session.episode)
+        case Loaded(brain, checkpoint):
+            return session._replace(brain=brain, checkpoint=checkpoint, chosen="", trouble="")
+        case Failed(why):
+            numbers = session.numbers | session.program.fixed
+            return session._replace(trouble=why, numbers=numbers, chosen="")
+    raise TypeError(f"{type(event).__name__} is no event of a session.")
+
+
+def _play(session: Session, seconds: float) -> Session:
+    """Takes the steps that are due; what a slow computer owes beyond MOST_OWED is forgiven."""
+    timestep = session.program.env.control_timestep
+    most = max(MOST_OWED * session.speed, timestep)
+    session = session._replace(owed=min(session.owed + seconds * session.speed, most))
+    due = timestep * (1 - 1e-6)  # sums of floats are a little off
+    while session.playing and session.owed >= due:
+        session = take_step(session._replace(owed=max(0.0, session.owed - timestep)))
+    return session
+
+
+def start_episode(session: Session, episode: int) -> Session:
+    """Starts an episode of the session's seed."""
+    key = episode_key(session.seed, episode)
+    moment, picture = session.program.start(session.numbers, key)
+    return session._replace(
+        episode=episode, moment=moment, picture=picture, rows=(), sums={}, length=0, grip=None
+    )
+
+
+def take_step(session: Session) -> Session:
+    """Takes one control step; an episode that ends makes room for the next."""
+    timestep = session.program.env.control_timestep
+    if session.grip is not None:
+        data = _place(session)
+        dqvel = push.pull(session.program.env.physics.model, data, session.grip, timestep)
+        session = _with_velocity(session, dqvel)
+    moment, shown = session.program.step(session.numbers, session.brain, session.moment)
+    length = session.length + 1
+    why = _end(session, shown, length)
+    if not shown.lost:
+        row = Row(
+            time=length * timestep,
+            reward=float(shown.reward),
+            metrics={name: float(value) for name, value in shown.metrics.items()},
+            action=np.asarray(shown.action),
+            value=float(shown.value),
+        )
+        session = _with_row(session, row, timestep)._replace(picture=shown.picture)
+    session = session._replace(moment=moment, length=length)
+    return _finished(session, why, timestep) if why else session._replace(instant=0)
+
+
+def _with_row(session: Session, row: Row, timestep: float) -> Session:
+    kept = min(MOST_ROWS, round(SECONDS_KEPT / timestep))
+    new = {"reward": row.reward} | {k: x for k, x in row.metrics.items() if k != "reward"}
+    sums = {name: session.sums.get(name, 0.0) + value for name, value in new.items()}
+    return session._replace(rows=(*session.rows[1 - kept :], row), sums=sums)
+
+
+def _end(session: Session, shown: Shown, length: int) -> str:
+    """Returns why the episode ends with this step, or ""."""
+    if shown.lost:
+        return "its numbers are NaN or absurd"
+    if shown.terminated:
+        return "terminated"
+    if shown.truncated:
+        return "truncated by the environment"
+    return "time limit" if length >= session.limit else ""
+
+
+def _finished(session: Session, why: str, timestep: float) -> Session:
+    """Says how the episode ended, and starts the next; stops where they all end at once."""
+    total = session.sums.get("reward", 0.0)
+    ended = (
+        f"Episode {session.episode} ended after {session.length * timestep:.2f} s ({why}), "
+        f"return {total:.4g}."
+    )
+    instant = session.instant + 1 if session.length == 1 else 0
+    session = start_episode(session, session.episode + 1)._replace(ended=ended, instant=instant)
+    if instant < INSTANT:
+        return session
+    trouble = (
+        f"The environment ends at its first step ({why}), {INSTANT} episodes in a row: change its "
+        "options, or the seed, and play on."
+    )
+    return session._replace(playing=False, trouble=trouble)
+
+
+def _place(session: Session) -> Any:
+    physics = session.moment.env.physics
+    return push.place(session.program.env.physics.model, physics.qpos, physics.qvel)
+
+
+def _pushed(session: Session, dv: tuple[float, float, float]) -> Session:
+    model, data = session.program.env.physics.model, _place(session)
+    root = root_body(model)
+    return _with_velocity(session, push.push(model, data, root, data.subtree_com[root], dv))
+
+
+def _held(session: Session, event: Pull) -> Session:
+    """Moves the pointer of a hold, or takes a new one."""
+    if session.grip is not None and session.grip.body == event.body:
+        return session._replace(grip=session.grip._replace(target=np.asarray(event.target)))
+    return session._replace(grip=push.grip(_place(session), *event))
+
+
+def _with_velocity(session: Session, dqvel: np.ndarray) -> Session:
+    """Adds to the body's velocities. The policy sees it after the next step, as of a real push."""
+    physics = session.moment.env.physics
+    qvel = physics.qvel + np.asarray(dqvel, np.float32)
+    env = session.moment.env.replace(physics=physics.replace(qvel=qvel))
+    return session._replace(moment=session.moment.replace(env=env))

@@ -1,0 +1,80 @@
+"""Opens a window on a run or an experiment: `python -m purerl.view EXPERIMENT_OR_RUN`.
+
+A page in the browser in which a run's policy drives the body, live; an experiment's body, the
+planner. Sliders change the numbers of the environment's options. A run's folder is only read, and
+may be training meanwhile.
+"""
+
+import importlib.util
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from purerl.core.errors import UserError
+from purerl.runs.command_errors import leave
+from purerl.runs.command_line import carry_out
+from purerl.runs.options import PlayOptions
+from purerl.runs.output import show
+from purerl.tune.plan.settings import Settings
+
+
+@dataclass(frozen=True)
+class Options(Settings, PlayOptions):
+    """Opens a page in which a policy or the planner drives the body, with sliders."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """A run's folder, such as runs/ant_run/seed1, or an experiment, such as ant_gaps."""
+    drive: Literal["", "policy", "planner"] = ""
+    """Who chooses the actions; by default a run's policy, and the planner of an experiment. Of a
+    run, plans correct its policy's actions, and its value counts at the horizon."""
+    host: str = "127.0.0.1"
+    """Where to listen. By default only this machine can open the page; over SSH, forward the port:
+    ssh -L 8080:127.0.0.1:8080 MACHINE."""
+    port: int = 8080
+    """The port to listen on."""
+
+    def __post_init__(self) -> None:
+        """Checks the rules."""
+        Settings.__post_init__(self)
+        PlayOptions.__post_init__(self)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    return carry_out(Options, command, "python -m purerl.view", arguments)
+
+
+def has_viser() -> bool:
+    """Tells whether the package that draws in the browser is installed."""
+    return importlib.util.find_spec("viser") is not None
+
+
+def command(options: Options) -> None:
+    """Opens the page and plays until Ctrl-C."""
+    if not has_viser():
+        raise UserError(
+            "The window needs the package viser: pip install -c constraints.txt -e '.[view]'."
+        )
+    from purerl.tune.view import opening
+    from purerl.tune.view.loop import check_port, play
+    from purerl.tune.view.page import Page
+
+    check_port(options.host, options.port)
+    session, source, title = opening.open_window(options)
+    page = Page(options.host, options.port, title)
+    try:
+        if options.port not in (0, page.port):  # viser takes the next one
+            raise UserError(f"Port {options.port} was taken meanwhile: give another, as --port.")
+        show(f"{title}: open http://{options.host}:{page.port} in a browser; Ctrl-C ends.")
+        play(page, session, source, lambda line: show(line))
+    except KeyboardInterrupt:
+        show("Closed.")
+    finally:
+        page.close()
+
+
+if __name__ == "__main__":
+    leave(main)

@@ -1,6 +1,0 @@
-"""The window: a page in the browser, with a body that a policy or the planner drives, live.
-
-May import: core, ppo, devices, runs, report, plan. Read: `session.py`, what is shown as pure
-functions; then `loop.py`, which plays it, and `page.py`, all that touches the browser. An edit here
-does not keep a run from resuming.
-"""

@@ -1,0 +1,130 @@
+"""`python -m purerl.sweep`: its command line and file, checked before anything is started."""
+
+import shlex
+
+import pytest
+
+from purerl import sweep
+from purerl.core.errors import SUCCESS, USAGE
+from purerl.runs.command_line import from_command_line
+from purerl.runs.experiment import find_source
+from tests.runs.test_run import TOY
+
+FILE = f"""
+experiment = "{TOY}"
+name = "widths"
+seeds = 2
+grid.ppo.learning-rate = [1e-3, 1e-4]
+grid.network.policy_hidden = [[8, 8], [16]]
+[settings]
+ppo.gamma = 0.9
+cache = false
+"""
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def dry(capsys, *words: str) -> list[list[str]]:
+    """Returns the commands of a dry run, without `python -m purerl.run`."""
+    assert sweep.main([*words, "--dry-run"]) == SUCCESS
+    lines = capsys.readouterr().out.splitlines()
+    assert all(line.startswith("python -m purerl.run ") for line in lines)
+    return [shlex.split(line)[3:] for line in lines]
+
+
+def test_a_point_is_a_command_that_run_takes(capsys, place):
+    words = ["--grid", "ppo.learning-rate=1e-3,1e-4", "network.policy-hidden=8 8,16", "--ppo.gamma"]
+    commands = dry(capsys, str(TOY), *words, "0.9", "--seeds", "2", "--no-cache")
+    assert len(commands) == 4 and list(place.iterdir()) == []
+    source = find_source(commands[0][0])
+    chosen, options = from_command_line(source, commands[2][1:], "run")
+    assert (chosen.ppo.learning_rate, chosen.ppo.gamma) == (1e-4, 0.9)
+    assert chosen.network.policy_hidden == (8, 8)
+    assert (options.name, options.num_seeds, options.cache) == ("p0002", 2, False)
+    assert str(options.runs) == "sweeps/toy_experiment"
+
+
+def test_a_file_says_the_same(capsys, place):
+    (place / "sweep.toml").write_text(FILE)
+    words = ["--grid", "ppo.learning-rate=0.001,0.0001", "--grid", "network.policy-hidden=8 8,16"]
+    words += ["--seeds", "2", "--name", "widths", "--ppo.gamma", "0.9", "--no-cache"]
+    assert dry(capsys, "sweep.toml") == dry(capsys, str(TOY), *words)
+    # The command line wins.
+    assert dry(capsys, "sweep.toml", "--name", "other")[0][-3] == "p0000"
+    assert "sweeps/other" in dry(capsys, "sweep.toml", "--name", "other")[0]
+
+
+MISTAKES = [
+    (["--grid", "ppo.lr=1,2"], "There is no setting 'ppo.lr'. Did you mean ppo.learning-rate?"),
+    (["--grid", "ppo.learning-rate=1e-3,fast"], "--ppo.learning-rate is 'fast'; it must be a num"),
+    (["--grid", "ppo.num-epochs=1,1.5"], "--ppo.num-epochs is '1.5'; it must be a whole number"),
+    (["--grid", "ppo.schedule=constant,linnear"], "linnear"),
+    (["--grid", "ppo.gamma=0.9,2"], "The point ppo.gamma=2: "),
+    (["--grid", "ppo.gamma="], "ppo.gamma has no value"),
+    (["--grid", "ppo.gamma"], "'ppo.gamma' names no values"),
+    (["--grid"], "names no values"),
+    ([], "Nothing is swept"),
+    (["--grid", "ppo.gamma=0.9,0.90"], "ppo.gamma has the value 0.90 twice"),
+    (["--grid", "ppo.gamma=0.9", "--grid", "ppo.gamma=0.8"], "ppo.gamma is given twice"),
+    (["--grid", "ppo.gamma=0.9", "--ppo.gamma=0.8"], "ppo.gamma is given twice"),
+    (["--grid", "seed=1,2"], "give --seeds 3"),
+    (["--gird", "ppo.gamma=0.9"], "no option --gird. Did you mean --grid?"),
+    (["--grid", "ppo.gamma=0.9", "--ppo.gama", "1"], "--ppo.gama. Did you mean --ppo.gamma?"),
+    (["--grid", "ppo.num-envs=1..10001"], "10,001 points, of at most 10,000"),
+    (["--grid", "ppo.gamma=0.9", "--num-seeds", "2"], "--num-seeds is no option of a sweep; give"),
+    (["--grid", "ppo.gamma=0.9", "--seeds", "0"], "seeds is 0; it must be at least 1"),
+    (["--grid", "ppo.gamma=0.9", "--random", "3"], "--grid and --random are two sweeps"),
+    (["--over", "ppo.gamma=0.9"], "say how many points: --random 20"),
+    (["--random", "3"], "--random draws nothing"),
+    (["--optuna", "3", "--over", "ppo.gamma=0.9..1", "--slurm", "a=1"], "leave one of them out"),
+    (["--grid", "ppo.gamma=0.9", "--name", "a/b"], "name is 'a/b'; it must be the name of one"),
+]
+
+
+@pytest.mark.parametrize(("words", "said"), MISTAKES, ids=[" ".join(m[0]) for m in MISTAKES])
+def test_a_mistake_is_one_line_and_starts_nothing(words, said, capsys, place):
+    assert sweep.main([str(TOY), *words]) == USAGE
+    told = capsys.readouterr()
+    (line,) = told.err.strip().splitlines()
+    assert line.startswith("purerl: ") and said in line
+    assert told.out == "" and list(place.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("experiment = 3", "names no experiment"),
+        ("experiment = ", "is no TOML"),
+        ('experiment = "x"\nsedes = 3', "There is no key 'sedes'. Did you mean 'seeds'?"),
+        ('experiment = "x"\ngrid = 3', "grid is 3; it must be a table, [grid]"),
+        ('experiment = "x"\n[grid]\na = [2020-01-01]', "it must be a number, a text or a list"),
+    ],
+)
+def test_a_file_with_a_mistake_is_one_line(text, said, capsys, place):
+    (place / "sweep.toml").write_text(text)
+    assert sweep.main(["sweep.toml"]) == USAGE
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("purerl: ") and said in line
+
+
+@pytest.mark.parametrize("package", ["optuna", "submitit"])
+def test_without_the_package_there_is_a_line_to_paste(package, capsys, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name, *_: None)
+    words = ["--grid", "ppo.gamma=0.9", "--slurm", "cluster=local"]
+    if package == "optuna":
+        words = ["--optuna", "3", "--over", "ppo.gamma=0.9..1"]
+    assert sweep.main([str(TOY), *words]) == USAGE
+    said = capsys.readouterr().err
+    assert said == f"purerl: The package {package} is not installed; run: pip install " + (
+        "'purerl[sweep]'\n"
+    )
+
+
+def test_help_names_every_option(capsys):
+    assert sweep.main(["--help"]) == SUCCESS
+    said = capsys.readouterr().out
+    assert all(word in said for word in ("--grid", "--over", "--optuna", "--slurm", "--dry-run"))

@@ -1,0 +1,229 @@
+"""Whole sweeps: stand-ins for runs; and one of real runs, killed in the middle."""
+
+import csv
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from purerl import sweep
+from purerl.core.errors import FAILURE, SUCCESS, USAGE
+from purerl.tune.sweep import scheduler, slurm
+from tests.checks.kills import read_lines
+from tests.runs.test_run import ROOT, TOY
+from tests.tune.sweep.test_scheduler import FAKE
+
+RATES = ["--grid", "ppo.learning-rate=1e-2,2e-3,9e-4"]
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """An empty folder, in which a run takes a tenth of a second."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(scheduler, "RUN", (str(FAKE),))
+    monkeypatch.setattr(scheduler, "POLL", 0.02)
+    return tmp_path
+
+
+def rows(name: str = "toy_experiment") -> list[dict]:
+    with (Path("sweeps") / name / "sweep.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def start(*words: str) -> int:
+    return sweep.main([str(TOY), "--jobs", "2", *words])
+
+
+@pytest.mark.slow
+def test_the_table_has_the_best_first_and_numbers_as_numbers(place, capsys):
+    assert start(*RATES, "--seeds", "5") == SUCCESS
+    found = rows()
+    assert [row["ppo.learning-rate"] for row in found] == ["2e-3", "9e-4", "1e-2"]
+    scores = [3 - (rate - 3e-3) ** 2 for rate in (2e-3, 9e-4, 1e-2)]  # of the middle seeds
+    assert [float(row["iqm"]) for row in found] == pytest.approx(scores)
+    for row in found:
+        assert row["n"] == "5" and row["status"] == "done"
+        assert 1 <= float(row["low"]) < float(row["iqm"]) < float(row["high"]) <= 5
+    assert "3 points (3 done), eval/episode_return at the end" in capsys.readouterr().out
+    with Image.open("sweeps/toy_experiment/sweep.png") as picture:
+        assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 20
+
+
+@pytest.mark.slow
+def test_a_point_that_fails_is_counted(place, capsys):
+    assert start("--grid", "ppo.gamma=0.9,0.5,0.6", "--seeds", "1") == FAILURE
+    found = {row["ppo.gamma"]: row for row in rows()}
+    assert found["0.9"]["status"] == "done" and list(found)[0] == "0.9"
+    assert found["0.5"]["said"] == "gamma is 0.5. Take another one."
+    assert found["0.6"]["said"] == "killed by SIGKILL" and found["0.6"]["n"] == "0"
+    said = capsys.readouterr().out
+    assert "3 points (1 done, 2 failed)" in said and "p0001 failed: gamma is 0.5." in said
+
+
+@pytest.mark.slow
+def test_other_values_under_the_same_name_are_refused(place, capsys):
+    assert start(*RATES) == SUCCESS
+    before = sorted(Path("sweeps").rglob("*"))
+    for words, named in [
+        (["--grid", "ppo.learning-rate=1e-2,2e-3,8e-4"], "swept.ppo.learning-rate"),
+        ([*RATES, "--seeds", "4"], "seeds: 3 -> 4"),
+        ([*RATES, "--ppo.num-steps", "500"], "settings.ppo.num_steps: 399 -> 500"),
+        (["--random", "3", "--over", "ppo.learning-rate=1e-2,2e-3,9e-4"], "points: grid -> random"),
+    ]:
+        capsys.readouterr()
+        assert start(*words) == USAGE
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert named in line and "was begun otherwise" in line
+    assert sorted(Path("sweeps").rglob("*")) == before
+    same = ["--grid", "ppo.learning_rate=0.01,0.002,0.0009"]
+    assert start(*same) == SUCCESS  # other words for the same
+
+
+@pytest.mark.slow
+def test_more_can_be_drawn_later(place):
+    words = ["--over", "ppo.learning-rate=log:1e-4:1e-1", "--seeds", "1"]
+    assert start("--random", "2", *words) == SUCCESS
+    first = {row["point"]: row for row in rows()}
+    assert start("--random", "4", *words) == SUCCESS
+    later = {row["point"]: row for row in rows()}
+    assert len(later) == 4 and {name: later[name] for name in first} == first
+
+
+@pytest.mark.slow
+def test_a_metric_that_no_run_has_is_told_after_the_first_one(place, capsys):
+    assert start(*RATES, "--metric", "eval/episode_retrun", "--jobs", "1") == USAGE
+    said = capsys.readouterr().err
+    assert "no metric 'eval/episode_retrun'" in said and "'eval/episode_return'" in said
+    assert len(list(Path("sweeps/toy_experiment/logs").iterdir())) == 1
+
+
+@pytest.mark.slow
+def test_two_processes_do_not_carry_out_one_sweep(place, capsys):
+    assert start(*RATES) == SUCCESS
+    lock = scheduler.RunLock(Path("sweeps/toy_experiment"))
+    assert start(*RATES) == USAGE
+    lock.close()
+    assert "is being carried out by another process" in capsys.readouterr().err
+
+
+# --- Optuna and submitit ---
+
+
+def has(package: str):
+    missing = importlib.util.find_spec(package) is None
+    return pytest.mark.skipif(missing, reason=f"{package} is not installed")
+
+
+@pytest.mark.slow
+@has("optuna")
+def test_optuna_goes_on_where_it_was(place):
+    words = ["--over", "ppo.learning-rate=log:1e-4:1e-1", "ppo.gamma=0.8,0.9", "--seeds", "2"]
+    words += ["--jobs", "1"]
+    assert start("--optuna", "3", *words, "--name", "whole") == SUCCESS
+    assert start("--optuna", "2", *words, "--name", "parts") == SUCCESS
+    from purerl.tune.sweep import study
+
+    one = study.open_study(Path("sweeps/parts"))
+    trials = one.get_trials()
+    assert [trial.value for trial in trials] == pytest.approx(
+        [1.5 - (trial.params["ppo.learning-rate"] - 3e-3) ** 2 for trial in trials]
+    )
+    # A kill between choosing a point and its score.
+    from optuna.distributions import CategoricalDistribution, FloatDistribution
+
+    rate = FloatDistribution(1e-4, 1e-1, log=True)
+    one.sampler = study._sampler(2)
+    spaces = {"ppo.learning-rate": rate, "ppo.gamma": CategoricalDistribution(("0.8", "0.9"))}
+    one.ask(spaces)
+    assert start("--optuna", "3", *words, "--name", "parts") == SUCCESS
+    assert rows("parts") == rows("whole") and len(rows("whole")) == 3
+
+
+@pytest.mark.slow
+@has("optuna")
+def test_optuna_is_told_of_failures(place):
+    words = ["--over", "ppo.gamma=0.5,0.6", "--optuna", "2", "--seeds", "1"]
+    assert start(*words) == FAILURE
+    assert [row["status"] for row in rows()] == ["failed", "failed"]
+    assert start(*words) == FAILURE  # no third one
+    assert len(rows()) == 2
+
+
+@pytest.mark.slow
+@has("submitit")
+def test_submitit_carries_points_out(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def call(slurm: str) -> subprocess.CompletedProcess:
+        words = ["--grid", "ppo.learning-rate=1e-3,1e-2", "--seeds", "2", "--slurm", slurm]
+        command = [sys.executable, "-m", "purerl.sweep", str(TOY), *words]
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        return subprocess.run(command, env=environment, capture_output=True, text=True)
+
+    said = call("cluster=local,timeout_min=5").stdout
+    assert "2 of 2 points submitted" in said
+    end = time.monotonic() + 240
+    while len(list(Path("sweeps").rglob("*_result.pkl"))) < 2:
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    assert "0 of 2 points submitted" in call("cluster=local,timeout_min=5").stdout
+    assert [row["status"] for row in rows()] == ["done", "done"]
+    wrong = call("cluster=local,timeot_min=5")
+    assert wrong.returncode == USAGE and "timeot_min" in wrong.stderr
+    (line,) = call("timeout_min=5").stderr.splitlines()
+    assert "There is no SLURM on this machine" in line
+
+
+@pytest.mark.slow
+@has("submitit")
+def test_a_task_whose_time_is_over_saves_and_goes_on(place):
+    from tests.tune.sweep.test_scheduler import job
+
+    one = job("a", "--ppo.gamma", "0.7")
+    task = slurm.Task(one)
+
+    def over(*_):
+        raise TimeoutError(task.checkpoint().function.job)
+
+    old = signal.signal(signal.SIGALRM, over)
+    signal.setitimer(signal.ITIMER_REAL, 1.5)
+    with pytest.raises(TimeoutError):
+        task()
+    signal.signal(signal.SIGALRM, old)
+    assert one.log.read_text().endswith("it is saved.\n[exit code 3]\n")
+    assert slurm.Task(one)() == "done"
+
+
+# --- real runs ---
+
+
+@pytest.mark.slow
+def test_a_sweep_that_was_killed_ends_as_one_left_in_peace(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = [str(TOY), "--grid", "ppo.learning-rate=1e-2,1e-3", "--seeds", "2"]
+    words += ["--ppo.num-steps", "4800", "--checkpoints", "15"]
+    assert sweep.main([*words, "--name", "peace", "--jobs", "2"]) == SUCCESS
+    command = [sys.executable, "-m", "purerl.sweep", *words, "--name", "killed", "--jobs", "1"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    killed = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
+    first = Path("sweeps/killed/toy_experiment/p0000-seed1")
+    while len(list((first / "checkpoints").glob("0*"))) < 2:
+        assert killed.poll() is None
+        time.sleep(0.01)
+    killed.kill()
+    killed.wait()
+    os.kill(int((first / ".lock").read_text()), signal.SIGKILL)
+    assert len((first / "metrics.jsonl").read_text().splitlines()) < 150
+    assert sweep.main([*words, "--name", "killed", "--jobs", "2"]) == SUCCESS
+    assert "--resume" in Path("sweeps/killed/logs/p0000.log").read_text()
+    for point in ("p0000", "p0001"):
+        lines = [read_lines(Path("sweeps") / name, point) for name in ("peace", "killed")]
+        assert lines[0] == lines[1] and list(map(len, lines[0])) == [150, 150]
+    assert rows("killed") == rows("peace")
