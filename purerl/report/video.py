@@ -46,10 +46,9 @@ def make_video(
     timestep = run.env.control_timestep
     # The files are named after the update, and after what is not the default.
     words = [f"{run.update:012d}", camera.replace("/", "-"), f"seed{seed}" if seed else ""]
-    path = run.folder / "videos" / f"{'_'.join(filter(None, words))}.mp4"
+    path = videos_of(run.folder) / f"{'_'.join(filter(None, words))}.mp4"
     with renderer_of(run.env, size, camera) as renderer:
         recording = _play(run, episodes, seconds, seed)
-        check_inside(run.folder, path.parent)
         draw(path, renderer, recording, timestep)
     told = zip(recording.length, recording.over, recording.episode_return, strict=True)
     lines = [
@@ -61,6 +60,12 @@ def make_video(
     with contextlib.suppress(UserError):  # metrics that cannot be read spoil no video
         lines += beside_evaluation(run_reader.read(run.folder).lines, run.update, whole)
     return path, lines
+
+
+def videos_of(folder: Path) -> Path:
+    """Returns the folder of a run's videos; UserError if it is a link to elsewhere."""
+    check_inside(folder, folder / "videos")
+    return folder / "videos"
 
 
 def renderer_of(env: Any, size: tuple[int, int], camera: str = "") -> Renderer:

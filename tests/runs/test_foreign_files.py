@@ -392,12 +392,12 @@ def test_a_video_is_not_written_through_a_link(given, tmp_path):
     (given / "videos").mkdir()
     (given / "videos" / ".1.png").symlink_to(precious)
     about = ([np.zeros((32, 32, 3), np.uint8)], 1, (32, 32), 1.0)
-    video._write_files(given / "videos" / "1.mp4", *about)
+    video._write_files(video.videos_of(given) / "1.mp4", *about)
     assert not (given / "videos" / "1.png").is_symlink()
     shutil.rmtree(given / "videos")
     (given / "videos").symlink_to(tmp_path)
     with pytest.raises(purerl.UserError, match="leaves the run's folder"):
-        video._write_files(given / "videos" / "1.mp4", *about)
+        video.videos_of(given)
     assert precious.read_text() == "diary"
 
 
