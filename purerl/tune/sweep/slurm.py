@@ -89,7 +89,7 @@ def submit(jobs: Sequence[Job], folder: Path, text: str, at_once: int) -> tuple[
     import submitit
 
     given = parameters(text)
-    cluster = given.pop("cluster", "slurm")
+    cluster = str(given.pop("cluster", "slurm"))
     place = folder / FOLDER
     try:
         executor = submitit.AutoExecutor(folder=place, cluster=cluster)
