@@ -22,7 +22,7 @@ from purerl.core.errors import INTERRUPTED, SUCCESS, USAGE, UserError, unknown_n
 from purerl.report.run_reader import read
 from purerl.runs.command_errors import leave
 from purerl.runs.files import runs_in
-from purerl.tune.sweep import main as sweep
+from purerl.sweep import main as sweep
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
