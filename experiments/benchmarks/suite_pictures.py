@@ -16,6 +16,7 @@ from experiments.benchmarks.suite_scores import (
     strata,
 )
 from purerl.report import bootstrap
+from purerl.report.comparison import plotter
 
 LINES = {"brax_ppo_end": ("brax PPO", "C1"), "reppo_end": ("REPPO, 200 M", "C2")}
 COLUMNS = 5
@@ -32,7 +33,7 @@ def draw_tasks(
       published: `references`.
       across: "steps" or "seconds".
     """
-    pyplot = _pyplot()
+    pyplot = plotter()
     columns = min(COLUMNS, len(tasks))
     rows = math.ceil(len(tasks) / columns)
     figure, panels = pyplot.subplots(
@@ -70,7 +71,7 @@ def _draw_task(panel: Any, seeds: Sequence[Seed], published: dict[str, float], a
 
 def draw_together(path: Path, tasks: dict[str, list[Seed]]) -> None:
     """Writes a picture of all tasks: IQM over steps, and the performance profile at the end."""
-    pyplot = _pyplot()
+    pyplot = plotter()
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
     steps, band = together(tasks)
     left.plot(steps, band.iqm, color="C0", linewidth=2)
@@ -105,13 +106,3 @@ def summary(tasks: dict[str, list[Seed]]) -> str:
     of = f" ({interval.low:.1f} to {interval.high:.1f})" if interval else ""
     number = sum(map(len, scores))
     return f"IQM of {len(tasks)} tasks, {number} runs: {bootstrap.pooled_iqm(scores):.1f}{of}"
-
-
-def _pyplot() -> Any:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    pyplot.style.use("tableau-colorblind10")
-    return pyplot

@@ -185,8 +185,8 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]
         writer.writerows(rows)
 
 
-def draw_curves(path: Path, curves: Iterable[Curve], metric: str) -> None:
-    """Writes a picture of each group's IQM, its band, and its runs as thin lines."""
+def plotter() -> Any:
+    """Returns matplotlib's pyplot, for pictures that are written to files alone."""
     import matplotlib  # most of a second
 
     matplotlib.use("Agg")
@@ -194,6 +194,12 @@ def draw_curves(path: Path, curves: Iterable[Curve], metric: str) -> None:
     from matplotlib import pyplot
 
     pyplot.style.use("tableau-colorblind10")
+    return pyplot
+
+
+def draw_curves(path: Path, curves: Iterable[Curve], metric: str) -> None:
+    """Writes a picture of each group's IQM, its band, and its runs as thin lines."""
+    pyplot = plotter()
     figure, axes = pyplot.subplots(figsize=(8, 5), layout="constrained")
     for i, curve in enumerate(curves):
         color = f"C{i % 10}"

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from purerl.core.errors import UserError
+from purerl.report.comparison import plotter
 from purerl.runs.output import printable
 from purerl.tune.sweep.spaces import Space
 from purerl.tune.sweep.table import Row, by_value, is_number
@@ -34,13 +35,7 @@ def draw(path: Path, rows: Sequence[Row], spaces: Sequence[Space], metric: str) 
     rows = [row for row in rows if row.summary["iqm"] is not None]
     if not rows:
         return False
-    import matplotlib  # most of a second
-
-    matplotlib.use("Agg")
-    matplotlib.rcParams["text.parse_math"] = False  # names are any text
-    from matplotlib import pyplot
-
-    pyplot.style.use("tableau-colorblind10")
+    pyplot = plotter()
     columns = min(COLUMNS, len(spaces))
     lines = -(-len(spaces) // columns)
     figure, axes = pyplot.subplots(

@@ -15,16 +15,6 @@ from purerl.tune.sweep import scheduler
 from purerl.tune.sweep.scheduler import Job, environment_of, find_gpus, jobs_at_once
 from tests.runs.test_run import ROOT
 
-FAKE = Path(__file__).parent / "fake_run.py"
-
-
-@pytest.fixture
-def place(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(scheduler, "RUN", (str(FAKE),))
-    monkeypatch.setattr(scheduler, "POLL", 0.02)
-    return tmp_path
-
 
 def job(name: str, *words: str, seeds: int = 2) -> Job:
     runs = Path("runs")

@@ -18,18 +18,8 @@ from purerl.core.errors import FAILURE, SUCCESS, USAGE
 from purerl.tune.sweep import scheduler, slurm
 from tests.checks.kills import read_lines
 from tests.runs.test_run import ROOT, TOY
-from tests.tune.sweep.test_scheduler import FAKE
 
 RATES = ["--grid", "ppo.learning-rate=1e-2,2e-3,9e-4"]
-
-
-@pytest.fixture
-def place(tmp_path, monkeypatch):
-    """An empty folder, in which a run takes a tenth of a second."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(scheduler, "RUN", (str(FAKE),))
-    monkeypatch.setattr(scheduler, "POLL", 0.02)
-    return tmp_path
 
 
 def rows(name: str = "toy_experiment") -> list[dict]:
