@@ -11,11 +11,15 @@ import numpy as np
 import pytest
 
 from purerl.core.records import Network, Normal, PolicyOutput
+from purerl.devices import memory
+from purerl.devices.programs import abstract_state
 from purerl.physics.interface import Physics
 from purerl.ppo.networks import MlpOptions, RecurrentOptions, from_linen, mlp, recurrent
-from purerl.runs import examine_env, examine_network
+from purerl.runs import examine, examine_env, examine_network
+from purerl.runs.build_experiment import build
 from purerl.runs.watch_physics import check_controls, check_placed
 from tests.runs.test_check_env import Toy, toy_state
+from tests.runs.toy_experiment import experiment
 
 pytestmark = pytest.mark.slow
 
@@ -85,6 +89,24 @@ class HalfDeaf(Toy):
         return super().step(state, action.at[1].set(0.0))
 
 
+def drawn():
+    """A number that the host draws anew at each call."""
+    draw = np.random.default_rng().normal
+    return jax.pure_callback(
+        lambda: np.float32(draw()), jax.ShapeDtypeStruct((), jnp.float32), vmap_method="sequential"
+    )
+
+
+class OtherStart(Toy):
+    def reset(self, key):
+        return toy_state(jax.random.normal(key, (2,)) + drawn())
+
+
+class OtherStep(Toy):
+    def step(self, state, action):
+        return toy_state(state.physics + 0.1 * action + drawn())
+
+
 class WrongReward(Toy):
     def step(self, state, action):
         return super().step(state, action).replace(reward=jnp.zeros(1))
@@ -103,12 +125,45 @@ class WrongReward(Toy):
         (Seeing(offset=1e5), "scale", "warning: observation/policy [2] varies by less than 1/"),
         (Seeing(scale=1e5), "scale", "warning: observation/policy [2] has a std beyond 10000"),
         (HalfDeaf(), "actions", "warning: entries 1 of 2 change nothing in"),
+        (OtherStart(), "same twice", "error:"),
+        (OtherStep(), "same twice", "error:"),
         (WrongReward(), "protocol", "error: reward is float32 [] from reset and float32 [1]"),
     ],
 )
 def test_it_finds_just_what_is_broken(env, about, text):
     found = bad(examine_env.examine(env))
     assert list(found) == [about] and found[about].startswith(text)
+
+
+@pytest.mark.parametrize(
+    ("room", "level"), [(1e12, "ok"), (1.5, "warning"), (0.5, "error")], ids=["ok", "tight", "full"]
+)
+def test_memory_is_compared_with_what_there_is(room, level, monkeypatch):
+    setup = build(experiment)
+    abstract = abstract_state(*setup[:3])
+    least = sum(memory.least(setup.config, abstract, setup.env.action_size).values())
+    monkeypatch.setattr(memory, "room", lambda: room * least)
+    found = examine.check_memory(setup, abstract)
+    assert found.level == level
+    assert level == "ok" or "lower" in found.text
+
+
+@pytest.mark.parametrize(("number", "level"), [(1, "ok"), (2, "warning")])
+def test_minibatches_of_few_samples_are_named(number, level):
+    """32 steps an update: one minibatch of 32, or two of 16."""
+    changed = dataclasses.replace(experiment.ppo, num_minibatches=number)
+    setup = build(dataclasses.replace(experiment, ppo=changed))
+    found = examine.check_minibatch(setup, abstract_state(*setup[:3]))
+    assert found.level == level and f"of {32 // number} steps each" in found.text
+
+
+def test_speed_is_measured_only_when_asked():
+    quick, timed = (list(examine.examine(experiment, speed)) for speed in (False, True))
+    assert timed[: len(quick)] == quick
+    alone, update = (one.text for one in timed[len(quick) :])
+    assert "of 8 environments alone" in alone and "12 updates take" in update
+    rate, whole = (float(text.split()[0].replace(",", "")) for text in (alone, update))
+    assert rate > whole > 0.0  # an update also learns
 
 
 def test_it_finds_nothing_in_a_good_one():
