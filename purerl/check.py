@@ -8,27 +8,34 @@ Exit codes: 0 no error, 1 an error was found, 2 a mistake in the command.
 
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from purerl.core.errors import FAILURE, USAGE, RunError, UserError
-from purerl.runs import experiment, output
+from purerl.runs import experiment, options, output
 from purerl.runs.command_errors import leave, tell
 
-NO_SPEED = "--no-speed"
+
+@dataclass(frozen=True)
+class Options(options.Options):
+    """What `run` takes, and what is left out here."""
+
+    speed: bool = True
+    """Measure how fast it is; --no-speed: do not."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
-        output.show(*str(__doc__).split("\n"), f"{NO_SPEED}: do not measure how fast it is.")
+        output.show(*str(__doc__).split("\n"), "--no-speed: do not measure how fast it is.")
         return 0 if arguments else USAGE
     try:
-        return _command([word for word in arguments if word != NO_SPEED], NO_SPEED in arguments)
+        return _command(arguments)
     except (UserError, RunError) as error:
         return tell(error)
 
 
-def _command(arguments: Sequence[str], no_speed: bool) -> int:
+def _command(arguments: Sequence[str]) -> int:
     """Prints each finding when it is found."""
     from purerl.devices import compilation
     from purerl.runs import training
@@ -44,11 +51,11 @@ def _command(arguments: Sequence[str], no_speed: bool) -> int:
         )
     source = experiment.find_source(arguments[0])
     prog = f"python -m purerl.check {arguments[0]}"
-    chosen, options = from_command_line(source, arguments[1:], prog)
-    compilation.set_up_jax(options.cache)
+    chosen, given = from_command_line(source, arguments[1:], prog, base=Options)
+    compilation.set_up_jax(given.cache)
     levels: list[str] = []
     with running():
-        for finding in examine(chosen, not no_speed):
+        for finding in examine(chosen, given.speed):
             output.show(str(finding))
             levels.append(finding.level)
     counts = {kind: levels.count(kind) for kind in ("error", "warning")}
