@@ -18,7 +18,7 @@ def sub_jaxprs(eqn: core.JaxprEqn) -> list[core.ClosedJaxpr]:
     params = (x if isinstance(x, tuple | list) else (x,) for x in eqn.params.values())
     traces = (item for items in params for item in items)
     return [
-        core.ClosedJaxpr(x, ()) if isinstance(x, core.Jaxpr) else x
+        x if isinstance(x, core.ClosedJaxpr) else core.ClosedJaxpr(x, ())  # one class since 0.11
         for x in traces
         if isinstance(x, core.Jaxpr | core.ClosedJaxpr)
     ]
