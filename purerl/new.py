@@ -38,8 +38,8 @@ def command(options: Options) -> None:
     from purerl.runs.new_project import write_project
 
     show(*map(str, write_project(options.name)), "", f"cd {shlex.quote(str(options.name))}")
-    show("python -m pytest                      # its tests")
-    show("python -m purerl.run experiment.py    # trains it")
+    show("python -m purerl.check experiment.py    # what can be checked before training")
+    show("python -m purerl.run experiment.py      # trains it")
 
 
 if __name__ == "__main__":

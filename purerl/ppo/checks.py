@@ -13,9 +13,9 @@ TRAINING = (
     (*SIZE, "num_envs rollout_length num_epochs num_minibatches episode_length"),
     ("at most 2**53", lambda x: x <= 2**53, "num_steps"),  # what reads metrics.jsonl has float64
     ("in [0, 1]", lambda x: 0.0 <= x <= 1.0, "gamma gae_lambda"),
-    ("above 0", lambda x: x > 0.0, "learning_rate clip max_gradient_norm desired_kl reward_scale"),
-    ("0 or above, and finite", lambda x: 0.0 <= x < math.inf, "value_weight entropy_weight"),
-    ("0 or above", lambda x: x >= 0, "segment_length"),
+    ("above 0, and finite", lambda x: 0.0 < x < math.inf, "learning_rate desired_kl reward_scale"),
+    ("above 0, and finite", lambda x: 0.0 < x < math.inf, "clip max_gradient_norm"),
+    ("0 or above", lambda x: 0.0 <= x < math.inf, "value_weight entropy_weight segment_length"),
 )
 EVALUATION = (
     (*SIZE, "num_episodes"),

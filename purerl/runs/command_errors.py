@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from typing import NoReturn
 
-from purerl.core.errors import RunError, StoppedError, UserError
+from purerl.core.errors import RunError, StoppedError, UserError, one_line
 from purerl.runs import output
 
 LAST_SECONDS = 15.0  # from the end of the main thread to that of the process
@@ -34,6 +34,14 @@ def leave(command: Callable[[], int]) -> NoReturn:
             output.show()  # what waits, of a help page too
     except (UserError, RunError) as error:
         code = tell(error)
+    except (RuntimeError, AssertionError) as error:
+        if not (named := os.environ.get("JAX_PLATFORMS")) or _jax_runs():
+            raise
+        why = f" ({one_line(error)})" if str(error) else ""
+        code = tell(UserError(
+            f"JAX_PLATFORMS is {named}, and this JAX cannot start that{why}: unset it, or install "
+            "JAX for that device (docs/howto/devices.md)."
+        ))  # fmt: skip
     except BrokenPipeError:
         code = 128 + signal.SIGPIPE
     except KeyboardInterrupt:
@@ -41,6 +49,14 @@ def leave(command: Callable[[], int]) -> NoReturn:
     output.settle(sys.stderr)
     end_in_time(code)
     sys.exit(code)
+
+
+def _jax_runs() -> bool:
+    """Tells whether JAX has found a device: with none, nothing has begun that could be wrong."""
+    try:
+        return bool(sys.modules["jax"].devices()) if "jax" in sys.modules else True
+    except (RuntimeError, AssertionError):
+        return False
 
 
 def end_in_time(code: int) -> None:

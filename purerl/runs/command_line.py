@@ -131,6 +131,9 @@ def _one_line(text: str, names: list[str]) -> str:
     unknown = re.search(r"Unrecognized options: (\S+?)[,=]? ", plain)
     if unknown:
         near = nearest(unknown[1], names)
+        if near == unknown[1]:  # a bool that is true: what turns it off is its only option
+            group, dot, name = near[2:].rpartition(".")
+            return f"{near} takes no value; --{group}{dot}no-{name} turns it off."
         return f"There is no option {unknown[1]}." + (f" Did you mean {near}?" if near else "")
     titles = "Value error|Missing argument|Invalid choice|Parsing error|Required options"
     plain = re.sub(rf"^({titles}) ", "", plain)

@@ -22,6 +22,7 @@ from purerl.runs.files import (
 from purerl.runs.lock import LOCK
 
 OURS = {LOCK, "config.json", "manifest.json", "experiment.py", "metrics.jsonl", "checkpoints"}
+EDITED = "fingerprint: config.json, manifest.json or experiment.py is not what the run wrote"
 MANY = 9  # edited files, which a refusal to resume then counts and does not list
 
 
@@ -119,8 +120,8 @@ def begin_or_go_on(
         raise UserError(
             f"The run {folder} was begun under other conditions, so it would not go on exactly:\n  "
             + "\n  ".join(_shortened(found))
-            + "\nGive the command it was begun with, train anew under another --name, or go on all "
-            "the same with --allow-changes."
+            + f"\n{cure(found)}, train anew under another --name, or go on all the same with "
+            "--allow-changes."
         )
     if found:
         checkpoint.check_fits(folder / "checkpoints", abstract)
@@ -143,7 +144,18 @@ def edited(folder: Path) -> list[str]:
     code = read_bytes(folder / "experiment.py")
     if facts.get("fingerprint") == identity.fingerprint(config, facts, code):
         return []
-    return ["fingerprint: config.json, manifest.json or experiment.py is not what the run wrote"]
+    return [EDITED]
+
+
+def cure(found: list[str]) -> str:
+    """Returns what takes a run back to what it was, by what was found."""
+    if EDITED in found:
+        return "Put the file back that was edited"
+    if any(line.startswith("vmapped_seeds") for line in found):
+        return "Give the --num-seeds and --seed it was begun with"
+    if any(line.startswith("settings.ppo.num_steps") for line in found):
+        return "To train longer, copy the run first (docs/howto/go_on.md)"
+    return "Give the command it was begun with"
 
 
 def _identity(folder: Path) -> dict[str, str]:

@@ -19,7 +19,7 @@ from purerl.devices.shards import Shards
 from purerl.exact import xla_flags
 from purerl.ppo import algorithm
 from purerl.ppo.config import Evaluation
-from purerl.runs import manifest
+from purerl.runs import manifest, run_folder
 from purerl.runs.build_experiment import build
 from purerl.runs.experiment import load
 from purerl.runs.identity import fingerprint
@@ -168,3 +168,34 @@ def test_a_run_on_c_imports_no_other_engine():
     words = [sys.executable, "-c", "\n".join(lines)]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.parametrize(
+    ("found", "cure"),
+    [
+        (["versions.jax: 0.10.2 -> 0.11.2"], "the command it was begun with"),
+        (["settings.ppo.gamma: 0.99 -> 0.9", run_folder.EDITED], "Put the file back"),
+        (["vmapped_seeds: {'first': 1, 'number': 3} -> (absent)"], "--num-seeds and --seed"),
+        (["schedule.log_every: 1 -> 2", "settings.ppo.num_steps: 9 -> 99"], "go_on.md"),
+    ],
+)
+def test_a_refusal_to_go_on_names_what_helps(found, cure):
+    """The command that a run was begun with helps neither an edited file nor a longer run."""
+    assert cure in run_folder.cure(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("platform", ["cuda", "gpu"])
+def test_a_platform_that_jax_lacks_is_named_in_one_line(platform):
+    # Of the CPU's JAX; where a GPU is, `rocm` is the one that is missing.
+    platform = platform if jax.default_backend() == "cpu" else "rocm"
+    words = [sys.executable, "-m", "purerl.run", str(TOY), "--name", "nowhere"]
+    ended = subprocess.run(
+        words,
+        env=os.environ | {"JAX_PLATFORMS": platform},
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    )
+    assert ended.returncode == 2 and len(ended.stderr.splitlines()) == 1
+    assert f"JAX_PLATFORMS is {platform}" in ended.stderr and "unset it" in ended.stderr
