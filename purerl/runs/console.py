@@ -109,6 +109,10 @@ def figures(record: Record, seconds_left: float, steps_per_second: float) -> str
     left = f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"
     lost = record.get("train/nonfinite_resets")
     warning = f"  {lost:,.0f} episodes lost (NaN, or absurd)" if lost else ""
+    if lost and not record.get("train/episodes"):
+        warning += ", and none else: python -m purerl.check names the number"
+    if record.get("train/episode_length") == 1.0:
+        warning += "  every episode ends at its first step: look at terminated"
     rate = f"{steps_per_second:,.0f} steps/s"
     return f"steps {record['steps']:,}  return {shown}{warning}  {rate}  left {left}"
 

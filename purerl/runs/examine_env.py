@@ -81,7 +81,7 @@ def first_state(start: State) -> list[Finding]:
     ended = np.asarray(start.terminated)
     if ended.any():
         what = f"{ended.sum()} of {size} episodes are terminated when reset returns"
-        found.append(error("ends", f"{what}: start elsewhere."))
+        found.append(error("ends", f"{what}: look at terminated in reset, or start elsewhere."))
     return [one for one in found if one.level != "ok"]
 
 
@@ -145,7 +145,11 @@ def check_ends(trial: Trial) -> Iterator[Finding]:
     first = np.asarray((trial.states.terminated | trial.states.truncated)[0])
     if ended.any():
         share = f"{ended.sum()} of {ended.size}"
-        yield error("ends", f"{share} episodes have ended when reset returns: start elsewhere.")
+        yield error(
+            "ends",
+            f"{share} episodes have ended when reset returns: look at terminated "
+            "in reset, or start elsewhere.",
+        )
     elif first.all():
         yield error("ends", "every episode ends at its first step: look at `terminated`.")
     else:

@@ -39,5 +39,5 @@ class Settings:
         for name in ("noise", "temperature"):
             if not 0.0 < getattr(self, name) < float("inf"):
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be above 0.")
-        if self.elites > self.samples:
+        if self.planner == "cem" and self.elites > self.samples:
             raise ValueError(f"elites is {self.elites}; there are only {self.samples} samples.")

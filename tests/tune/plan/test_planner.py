@@ -65,7 +65,7 @@ def test_where_the_reward_says_nothing_a_random_sample_is_taken(name):
     [
         ({"samples": 1}, "samples is 1; it must be at least 2."),
         ({"noise": 0.0}, "noise is 0.0; it must be above 0."),
-        ({"samples": 4, "elites": 5}, "elites is 5; there are only 4 samples."),
+        ({"planner": "cem", "samples": 4, "elites": 5}, "elites is 5; there are only 4 samples."),
     ],
 )
 def test_settings_out_of_range(settings, message):
