@@ -6,6 +6,8 @@ far. So a process that resumes a run cannot go on with its episodes: they count 
 anew. The run's plan says so.
 """
 
+import difflib
+import sys
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
@@ -25,6 +27,7 @@ from purerl.core.records import Array
 from purerl.physics.interface import PhysicsState
 
 _DRAWN = ("qpos", "qvel", "act", "qacc_warmstart", "mocap_pos", "mocap_quat")
+FEW = 5  # of Gymnasium's names, told to who misspells one
 _STANDS = 0.05  # simulated seconds of a step, where an environment does not say [s]
 
 
@@ -50,7 +53,15 @@ def from_gymnasium(
       ValueError: Gymnasium has none of that name, or its spaces are not those of `from_maker`.
     """
     if options.name not in gymnasium.registry:
-        raise ValueError(unknown_name("environment of Gymnasium", options.name, gymnasium.registry))
+        package, slash, _ = options.name.partition("/")
+        if slash:
+            raise ValueError(
+                f"There is no environment of Gymnasium {options.name!r}: install and import the "
+                f"package that brings {package}, or build it by from_maker."
+            )
+        near = difflib.get_close_matches(options.name, gymnasium.registry, FEW, cutoff=0)
+        message = unknown_name("environment of Gymnasium", options.name, near)
+        raise ValueError(message.removesuffix(".") + ", ...")
     return from_maker(lambda: gymnasium.make(options.name, max_episode_steps=-1))
 
 
@@ -140,11 +151,31 @@ class _Episode:
     over: bool = False
 
 
+def warned_once(make: Callable[[], gymnasium.Env]) -> Callable[[], gymnasium.Env]:
+    """Returns `make`, of which MuJoCo says each warning once: each episode compiles its XML."""
+    told: set[str] = set()
+
+    def tell(text: str) -> None:
+        if text not in told:
+            told.add(text)
+            print(f"MuJoCo: {text.strip()}", file=sys.stderr)
+
+    def made() -> gymnasium.Env:
+        mujoco.set_mju_user_warning(tell)
+        try:
+            return make()
+        finally:
+            mujoco.set_mju_user_warning(None)
+
+    return made
+
+
 class _Pool:
     """The objects whose episodes run, by the seed of the episode."""
 
     def __init__(self, make: Callable[[], gymnasium.Env]) -> None:
-        self.make, self.example = make, make()
+        self.make = warned_once(make)
+        self.example = self.make()
         space: Any = self.example.action_space
         self.low, self.high = getattr(space, "low", 0), getattr(space, "high", 0)
         self.episodes: OrderedDict[tuple[int, ...], _Episode] = OrderedDict()

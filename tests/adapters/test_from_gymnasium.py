@@ -4,6 +4,7 @@ import json
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -11,6 +12,8 @@ import purerl
 from purerl import adapters, check_env
 
 gymnasium = pytest.importorskip("gymnasium")
+
+from purerl.adapters import gymnasium_envs  # noqa: E402
 
 
 class Counter(gymnasium.Env):
@@ -174,5 +177,21 @@ def test_a_mujoco_environment_is_stepped_as_by_itself_and_drawn():
         np.testing.assert_allclose(state.reward, reward, rtol=1e-5)
     np.testing.assert_allclose(state.physics.qpos, theirs.unwrapped.data.qpos, rtol=1e-6)
     assert env.physics.model.nq == 9 and env.control_timestep == pytest.approx(0.05)
-    with pytest.raises(ValueError, match="HalfCheetah-v5"):
+
+
+def test_a_name_that_gymnasium_has_not_is_answered_with_few():
+    with pytest.raises(ValueError, match="Did you mean 'HalfCheetah-v5'") as told:
         adapters.from_gymnasium(adapters.GymnasiumOptions("HalfCheeta-v5"))
+    assert str(told.value).count(",") == 5
+    with pytest.raises(ValueError, match="install and import the package that brings ALE"):
+        adapters.from_gymnasium(adapters.GymnasiumOptions("ALE/Pong-v5"))
+
+
+def test_a_warning_of_mujoco_is_told_once(capsys, tmp_path, monkeypatch):
+    """Each environment of a batch compiles its XML, and would warn each time, and log it."""
+    monkeypatch.chdir(tmp_path)
+    xml = '<mujoco><compiler settotalmass="14"/><worldbody/></mujoco>'
+    make = gymnasium_envs.warned_once(lambda: mujoco.MjModel.from_xml_string(xml))
+    make(), make()
+    assert capsys.readouterr().err.count("settotalmass") == 1
+    assert not list(tmp_path.iterdir())
