@@ -48,7 +48,7 @@ def set_up_jax(cache: bool) -> str:
     """Sets the options of JAX on which bits depend, and the cache of compiled programs.
 
     Returns the cache's folder; "off" without `cache`, or if the environment has none
-    (JAX_ENABLE_COMPILATION_CACHE=false).
+    (JAX_ENABLE_COMPILATION_CACHE=false), or if its folder cannot be made.
     """
     jax.config.update("jax_threefry_partitionable", True)
     jax.config.update("jax_default_prng_impl", "threefry2x32")
@@ -56,7 +56,14 @@ def set_up_jax(cache: bool) -> str:
         jax.config.update("jax_enable_compilation_cache", False)
         return "off"
     # JAX has read JAX_COMPILATION_CACHE_DIR by now, if it is set.
-    compile_cache.use(compile_cache.in_use() or str(cache_folder()))
+    folder = compile_cache.in_use() or str(cache_folder())
+    try:
+        if "://" not in folder:  # a bucket is JAX's own
+            Path(folder).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        jax.config.update("jax_enable_compilation_cache", False)
+        return f"off: {folder} cannot be made ({error.strerror})"
+    compile_cache.use(folder)
     return compile_cache.in_use()
 
 

@@ -14,7 +14,7 @@ import tyro
 from purerl.core.errors import SUCCESS, RunError, UserError, nearest
 from purerl.runs import experiment, output
 from purerl.runs.command_errors import tell
-from purerl.runs.experiment import Experiment, Source
+from purerl.runs.experiment import Experiment, Source, available
 from purerl.runs.options import Options
 
 CONFIG = (tyro.conf.FlagCreatePairsOff,)
@@ -86,13 +86,16 @@ def from_settings(
       settings: "ppo.num_envs" -> value.
       options: "num_seeds" -> value.
     """
+    if not isinstance(settings, Mapping):
+        raise UserError(f"settings is {settings!r}; give a dict, such as {{'ppo.gamma': 0.99}}.")
     for name, value in settings.items():
         held = getattr(source.experiment, name, None)
         if isinstance(value, Mapping) and dataclasses.is_dataclass(held):
             dotted = {f"{name}.{inner}": one for inner, one in value.items()}
             raise UserError(f"Settings of {name} have dotted names: give {dotted}.")
     words = [word for pair in {**settings, **options}.items() for word in _words(*pair)]
-    return from_command_line(source, words, f"python -m purerl.run {source.name}", WORDS)
+    known = source.name if source.name in available() else source.path
+    return from_command_line(source, words, f"python -m purerl.run {known}", WORDS)
 
 
 def _words(name: str, value: Any) -> list[str]:

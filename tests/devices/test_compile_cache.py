@@ -166,3 +166,16 @@ def test_the_folder_is_told_without_the_prefix():
     folder = compilation.set_up_jax(cache=True)
     assert folder == compilation.set_up_jax(cache=True) == os.environ["JAX_COMPILATION_CACHE_DIR"]
     assert jax.config.values["jax_compilation_cache_dir"] == f"{compile_cache.PREFIX}{folder}"
+
+
+def test_a_cache_whose_folder_cannot_be_made_is_off_and_said_so(tmp_path):
+    (tmp_path / "file").touch()
+    folder = str(tmp_path / "file" / "jax")
+    found = subprocess.run(
+        [sys.executable, "-c", SET_UP], env=os.environ | {"JAX_COMPILATION_CACHE_DIR": folder},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert found.stdout == f"off: {folder} cannot be made (Not a directory)\n"
+
+
+SET_UP = "from purerl.devices.compilation import set_up_jax; print(set_up_jax(True))"
