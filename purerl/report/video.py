@@ -111,7 +111,7 @@ def beside_evaluation(
     said = f"evaluation after update {known[-1]['update']:,}: return {mean:.2f} +- {std:.2f}, "
     said += f"from {low:.2f} to {high:.2f}; "
     if not whole:
-        return [said + "no episode above came to its end, so their returns are no match for that"]
+        return [said + "no episode above came to its end, so none can be compared with it"]
     return [said + f"whole episodes above in that range: {among} of {len(whole)}"]
 
 

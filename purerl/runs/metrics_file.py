@@ -59,9 +59,12 @@ class MetricsFile:
     def write(self) -> None:
         """Writes what was taken. OSError: not yet, and nothing of it."""
         try:
-            written = self.file.write(self.pending)
-            if written != len(self.pending):
-                raise OSError(f"only {written} of {len(self.pending)} bytes were written")
+            rest = self.pending
+            while rest:  # after half of it, the rest meets the reason, such as a full disk
+                written = self.file.write(rest)
+                if not written:
+                    raise OSError("nothing was written")
+                rest = rest[written:]
         except OSError:
             self.file.truncate(self.offset)
             raise

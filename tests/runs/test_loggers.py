@@ -75,7 +75,7 @@ def test_a_full_disk_leaves_no_gap_and_no_torn_line(tmp_path):
 
     file.file = Full()
     for number in (2, 3):
-        with pytest.raises(OSError):
+        with pytest.raises(OSError, match="No space left"):  # and not how many bytes there were
             append(file, {"n": number})
         assert (tmp_path / "m").read_text() == '{"n": 1}\n'
     file.file = raw
