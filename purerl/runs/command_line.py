@@ -133,6 +133,8 @@ def _one_line(text: str, names: list[str]) -> str:
     plain = " ".join(re.sub(r"[─-╿]|-{5,}", " ", text).split())
     unknown = re.search(r"Unrecognized options: (\S+?)[,=]? ", plain)
     if unknown:
+        if unknown[1] in ("True", "False"):
+            return "A switch takes no value: give its option alone, or leave it out."
         near = nearest(unknown[1], names)
         if near == unknown[1]:  # a bool that is true: what turns it off is its only option
             group, dot, name = near[2:].rpartition(".")

@@ -110,7 +110,7 @@ def figures(record: Record, seconds_left: float, steps_per_second: float) -> str
     lost = record.get("train/nonfinite_resets")
     warning = f"  {lost:,.0f} episodes lost (NaN, or absurd)" if lost else ""
     if lost and not record.get("train/episodes"):
-        warning += ", and none else: python -m purerl.check names the number"
+        warning += ", and no other has ended: python -m purerl.check EXPERIMENT may say why"
     if record.get("train/episode_length") == 1.0:
         warning += "  every episode ends at its first step: look at terminated"
     rate = f"{steps_per_second:,.0f} steps/s"

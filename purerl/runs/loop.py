@@ -180,12 +180,17 @@ def _describe_evaluation(records: Sequence[Record], plan: Plan) -> str:
 
 
 def shown_record(records: Sequence[Record]) -> Record:
-    """Returns what progress shows: a run's own line, of many seeds their mean return, all lost."""
+    """Returns what progress shows: a run's own line, of many seeds their mean return, all episodes.
+
+    The length is that of the seed with the longest.
+    """
     returns = [r["train/episode_return"] for r in records]
     known = [value for value in returns if value is not None]
     return records[0] | {
         "train/episode_return": sum(known) / len(known) if known else None,
         "train/nonfinite_resets": sum(r["train/nonfinite_resets"] for r in records),
+        "train/episodes": sum(r["train/episodes"] for r in records),
+        "train/episode_length": max(r["train/episode_length"] or 0.0 for r in records),
     }
 
 

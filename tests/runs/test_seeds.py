@@ -10,7 +10,16 @@ import pytest
 from purerl import run
 from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE, RunError, UserError
 from purerl.devices import programs
-from purerl.runs import checkpoint, checkpoint_folder, loop, session, state_arrays, training, writer
+from purerl.runs import (
+    checkpoint,
+    checkpoint_folder,
+    console,
+    loop,
+    session,
+    state_arrays,
+    training,
+    writer,
+)
 from tests.runs.test_run import ROOT, TOY, Stopper, digest, folder, lines, start
 
 CARTPOLE = ["--ppo.num-envs", "4", "--ppo.rollout-length", "8", "--ppo.num-steps", "128"]
@@ -189,7 +198,17 @@ def test_the_number_of_seeds_has_a_rule(tmp_path, capsys):
 
 
 def test_progress_of_seeds_shows_their_mean_return_and_all_that_was_lost():
-    names = ("train/episode_return", "train/nonfinite_resets", "update")
-    rows = [(1.0, 0.0, 3), (None, 2.0, 3), (2.0, 5.0, 3)]
-    records = [dict(zip(names, row, strict=True)) for row in rows]
-    assert list(loop.shown_record(records).values()) == [1.5, 7.0, 3]
+    names = ("episode_return", "nonfinite_resets", "episodes", "episode_length")
+    rows = [(1.0, 0.0, 2.0, 1.0), (None, 2.0, 0.0, None), (2.0, 5.0, 1.0, 9.0)]
+    keys = [f"train/{name}" for name in names]
+    records = [{"update": 3} | dict(zip(keys, row, strict=True)) for row in rows]
+    assert list(loop.shown_record(records).values()) == [3, 1.5, 7.0, 3.0, 9.0]
+
+
+def test_progress_says_where_to_look_when_every_episode_is_lost_or_one_step_long():
+    record = {"steps": 1, "train/nonfinite_resets": 4.0, "train/episodes": 0.0}
+    assert "purerl.check" in console.figures(record, 1.0, 1.0)
+    assert "purerl.check" not in console.figures(record | {"train/episodes": 1.0}, 1.0, 1.0)
+    short = {"steps": 1, "train/episode_length": 1.0}
+    assert "look at terminated" in console.figures(short, 1.0, 1.0)
+    assert "terminated" not in console.figures(short | {"train/episode_length": 1.5}, 1.0, 1.0)
