@@ -27,7 +27,7 @@ from purerl.core.records import Array
 from purerl.physics.interface import PhysicsState
 
 _DRAWN = ("qpos", "qvel", "act", "qacc_warmstart", "mocap_pos", "mocap_quat")
-FEW = 5  # of Gymnasium's names, told to who misspells one
+_FEW = 5  # of Gymnasium's names, told to who misspells one
 _STANDS = 0.05  # simulated seconds of a step, where an environment does not say [s]
 
 
@@ -59,7 +59,7 @@ def from_gymnasium(
                 f"There is no environment of Gymnasium {options.name!r}: install and import the "
                 f"package that brings {package}, or build it by from_maker."
             )
-        near = difflib.get_close_matches(options.name, gymnasium.registry, FEW, cutoff=0)
+        near = difflib.get_close_matches(options.name, gymnasium.registry, _FEW, cutoff=0)
         message = unknown_name("environment of Gymnasium", options.name, near)
         raise ValueError(message.removesuffix(".") + ", ...")
     return from_maker(lambda: gymnasium.make(options.name, max_episode_steps=-1))
