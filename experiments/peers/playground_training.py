@@ -12,18 +12,11 @@ import functools
 import json
 import time
 
-import jax
-import jax.numpy as jnp
-
-# brax 0.14.2 calls what jax 0.11 no longer has.
-if not hasattr(jax, "device_put_replicated"):
-    jax.device_put_replicated = lambda x, devices: jax.tree.map(
-        lambda leaf: jnp.stack([leaf] * len(devices)), x
-    )
-
 from brax.training.agents.ppo import networks, train
 from mujoco_playground import registry, wrapper
 from mujoco_playground.config import dm_control_suite_params
+
+from experiments.peers.brax_peer import lend_removed_function
 
 
 def main() -> None:
@@ -34,6 +27,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=5_000_000)
     parser.add_argument("--evaluations", type=int, default=6)
     options = parser.parse_args()
+    lend_removed_function()
     settings = dict(dm_control_suite_params.brax_ppo_config(options.task))
     widths = settings.pop("network_factory", {})
     settings |= {"num_timesteps": options.steps, "num_evals": options.evaluations}
