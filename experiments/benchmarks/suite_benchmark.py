@@ -2,12 +2,13 @@
 
     python -m experiments.benchmarks.suite_benchmark                       # every task: hours
     python -m experiments.benchmarks.suite_benchmark cheetah-run hopper-hop --steps 3000000
-    python -m experiments.benchmarks.suite_benchmark --scores results/suite/seeds.csv  # no training
+    python -m experiments.benchmarks.suite_benchmark --scores mine.csv runs/suite  # no training
 
 Other words are settings, as `python -m purerl.run suite --help` lists them. All seeds of a task
-are vmapped in one process, as many processes at once as the machine takes. The same command goes on
-with what was stopped; a seed that fails is counted as failed. It is a sweep over `env.task`, and
-its folder is one of `python -m purerl.sweep`.
+are vmapped in one process, as many processes at once as the machine takes. The same command goes
+on with what was stopped; a seed that fails is counted as failed. It is a sweep over `env.task`, and
+its folder is one of `python -m purerl.sweep`. What several machines have trained becomes one table
+by `--scores`.
 """
 
 import argparse
@@ -39,10 +40,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=0, help="processes at once; 0: by the machine")
     parser.add_argument("--name", default="suite", help="of the sweep, a folder in sweeps/")
     parser.add_argument("--out", type=Path, help="folder for tables and pictures; the sweep's own")
-    parser.add_argument("--scores", type=Path, help="draw this seeds.csv again, and train nothing")
+    parser.add_argument(
+        "--scores",
+        type=Path,
+        nargs="+",
+        metavar="PATH",
+        help="train nothing: score these files seeds.csv, and folders of runs",
+    )
     options, settings = parser.parse_known_args(arguments)
     if options.scores is not None:
-        report(suite_scores.read_seeds(options.scores), options.out or options.scores.parent)
+        report(suite_scores.merged(map(scored, options.scores)), options.out or Path("."))
         return SUCCESS
     for task in options.tasks:
         if task not in TASKS:
@@ -50,12 +57,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     folder = Path("sweeps") / options.name
     code = sweep([*words(options, settings)])
     if code != USAGE:
-        found = [read(run) for run in runs_in(folder / "suite")] if folder.is_dir() else []
-        seeds = [suite_scores.seed_of(run) for run in found]
+        seeds = scored(folder / "suite") if folder.is_dir() else []
         if code != INTERRUPTED:
             seeds += never_begun(options, seeds)
         report(seeds, options.out or folder)
     return code
+
+
+def scored(place: Path) -> list[suite_scores.Seed]:
+    """Returns the seeds of a file that `report` wrote, or of the suite's runs in a folder."""
+    if place.is_file():
+        return suite_scores.read_seeds(place)
+    runs = map(read, runs_in(place))
+    return [suite_scores.seed_of(run) for run in runs if "env.task" in run.settings]
 
 
 def never_begun(

@@ -7,6 +7,7 @@ PPO trained for 79 to 184 M steps, SAC for 5 to 26 M, REPPO for 200 M.
 """
 
 import csv
+import itertools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -81,6 +82,16 @@ def read_seeds(path: Path) -> list[Seed]:
         else Seed(*name, (), (), ())
         for name, points in found.items()
     ]
+
+
+def merged(sources: Iterable[Iterable[Seed]]) -> list[Seed]:
+    """Returns each seed of a task once, from several sources: of one that two have, the longer."""
+    found: dict[tuple[str, int], Seed] = {}
+    for s in itertools.chain.from_iterable(sources):
+        name = (s.task, s.seed)
+        if name not in found or s.steps[-1:] > found[name].steps[-1:]:
+            found[name] = s
+    return sorted(found.values())
 
 
 def references(path: Path = REFERENCES) -> dict[str, dict[str, float]]:

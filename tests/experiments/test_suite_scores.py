@@ -41,6 +41,16 @@ def test_what_is_written_is_read_back(tmp_path):
     assert sorted(suite_scores.read_seeds(tmp_path / "seeds.csv")) == sorted(SEEDS)
 
 
+def test_of_a_seed_that_two_machines_have_the_longer_counts(tmp_path):
+    short, long = seed(1, 5.0, status="unfinished"), seed(1, 5.0, 7.0)
+    other = seed(2, 1.0)
+    for name, seeds in (("a.csv", [long, other]), ("b.csv", [short])):
+        suite_scores.write_seeds(tmp_path / name, seeds)
+    for order in ("ab", "ba"):
+        read = [suite_benchmark.scored(tmp_path / f"{name}.csv") for name in order]
+        assert suite_scores.merged(read) == [long, other]
+
+
 def test_ahead_is_at_or_above():
     tasks = suite_scores.by_task(SEEDS)
     published = {"cheetah-run": {"x": 600.0, "y": 600.1}, "hopper-hop": {"x": 15.1}}
