@@ -81,6 +81,9 @@ class Options:
     least_height: float | None = None
     """Of the torso above the ground, below which the episode ends [m]; none: the body's own, below
     which it lies. Lower, a foot that slips into a gap is no end: the body can climb out."""
+    healthy_turn: float | None = None
+    """How far the torso may turn from the way ahead, seen from above, until the episode ends [rad];
+    none: the body's own, for an ant no limit. Above pi, a rodent may run tail first."""
     healthy_up: float = 0.0
     """Least z of the torso's up-axis: below, the body lies on its back, which ends the episode."""
     reset_noise: float = 0.01
@@ -226,8 +229,9 @@ def is_healthy(body: Body, options: Options, height: Array, up: Array, turn: Arr
     low, high = body.healthy_height
     if options.least_height is not None:
         low = options.least_height
+    farthest = body.healthy_turn if options.healthy_turn is None else options.healthy_turn
     upright = (height > low) & (height < high) & (up > options.healthy_up)
-    return upright & (turn < body.healthy_turn)
+    return upright & (turn < farthest)
 
 
 def reward_terms(

@@ -12,16 +12,18 @@ experiment = Experiment(
     build_env=tasks.build,
     env=tasks.Options(),
     build_network=networks.mlp,
-    network=networks.MlpOptions(policy_hidden=(128, 128), value_hidden=(128, 128)),
+    network=networks.MlpOptions(policy_hidden=(128, 128), value_hidden=(128, 128), initial_std=1.0),
     ppo=Config(
         num_steps=3_000_000,
-        num_envs=128,
+        num_envs=64,
         rollout_length=64,
         num_epochs=4,
         num_minibatches=8,
         learning_rate=1e-3,
         schedule="linear",
-        reward_scale=0.1,
+        entropy_weight=0.01,  # without it, seeds of the cart-pole balanced and then forgot it
+        reward_scaling="return_std",
+        reward_scale=1.0,
     ),
     evaluation=Evaluation(num_episodes=32, number=6),
 )

@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("tasks", nargs="*", help="which tasks; all by default")
     parser.add_argument("--steps", type=int, default=10_000_000, help="control steps of each run")
     parser.add_argument("--seeds", type=int, default=5, help="seeds of each task")
-    parser.add_argument("--first-seed", type=int, default=10, help="others than those chosen on")
+    parser.add_argument("--first-seed", type=int, default=20, help="others than those chosen on")
     parser.add_argument("--jobs", type=int, default=0, help="processes at once; 0: by the machine")
     parser.add_argument("--name", default="suite", help="of the sweep, a folder in sweeps/")
     parser.add_argument("--out", type=Path, help="folder for tables and pictures; the sweep's own")

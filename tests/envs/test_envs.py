@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from envs import arenas, cartpole_swingup, run
-from envs.bodies import ANT
+from envs.bodies import ANT, RODENT
 from experiments.peers import brax_env
 from purerl.physics.interface import PhysicsState
 from purerl.runs.check_env import check_env
@@ -117,6 +117,13 @@ def test_the_torsos_subtree_is_the_ant_and_only_the_ant():
 def test_an_ant_on_its_back_is_not_healthy(height, up, healthy):
     height, up, turn = jnp.float32(height), jnp.float32(up), jnp.float32(3.0)
     assert bool(run.is_healthy(ANT, run.Options(), height, up, turn)) is healthy
+
+
+@pytest.mark.parametrize(("limit", "healthy"), [(None, False), (3.2, True), (1.9, False)])
+def test_how_far_a_body_may_turn_is_its_own_limit_or_the_options(limit, healthy):
+    height, up, turn = jnp.float32(0.06), jnp.float32(1.0), jnp.float32(2.0)
+    options = run.Options(healthy_turn=limit)
+    assert bool(run.is_healthy(RODENT, options, height, up, turn)) is healthy
 
 
 def test_an_overturned_ant_ends_its_episode():
