@@ -2,7 +2,7 @@
 
 python -m purerl.run suite --env.task cheetah-run --name cheetah-run
 
-Expected: return 600 of 1000 after 3 min, on two CPU cores; others: docs/measurements/suite.md.
+Expected: return 870 of 1000 after 4 min, on one CPU core; others: docs/measurements/suite.md.
 """
 
 from envs.suite import tasks
