@@ -69,6 +69,7 @@ def help_page(*words):
 def all_help():
     """Returns the help pages of all our commands, those of `run` for some experiments."""
     pages = [help_page("purerl.run", name) for name in ("ant_gaps", "custom_network", "suite")]
+    pages.append(help_page("experiments.benchmarks.suite_benchmark"))
     return "".join([*pages, *(help_page(f"purerl.{n}") for n in COMMANDS if n != "run")])
 
 
