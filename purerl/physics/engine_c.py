@@ -11,7 +11,7 @@ import math
 import os
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,7 @@ class CEngine:
         self.name = f"purerl-{hash_model(self.model, (*record._fields, stage))}"
         data = mujoco.MjData(model)
         self.shapes = [np.shape(getattr(data, name)) for name in record._fields]
-        self.batches: dict[tuple[int, tuple[str, ...]], Batch] = {}
+        self.rows: dict[tuple, Rows] = {}  # by number, fields and changed fields
         # XLA may run the callbacks of independent programs on several threads at once.
         self.lock = threading.Lock()
 
@@ -76,14 +76,25 @@ class CEngine:
         state = jax.tree.unflatten(structure, out[: len(leaves)])
         return state, self.record(*map(_as_matrix, self.record._fields, out[len(leaves) :]))
 
-    def batch(self, number: int, names: tuple[str, ...]) -> Batch:
-        """Returns the simulations for `number` environments with the changed fields `names`."""
-        if (number, names) not in self.batches:
+    def rows_of(self, number: int, fields: tuple[str, ...], names: tuple[str, ...]) -> "Rows":
+        """Returns the simulations of `number` environments, and where their packed rows go."""
+        if (number, fields, names) not in self.rows:
             # MuJoCo by itself starts a thread for each core of the machine, of which this process
             # may use a few: 64 threads on two cores stepped ants at 0.74 of the rate of two.
             cores = len(os.sched_getaffinity(0))
-            self.batches[number, names] = Batch(_movable(self.model, names), number, nthread=cores)
-        return self.batches[number, names]
+            batch = Batch(_movable(self.model, names), number, nthread=cores)
+            state, out = ([batch.bind(n) for n in x] for x in (fields, self.record._fields))
+            targets = [*state, batch.bind("ctrl"), *(batch.expand(n) for n in names)]
+            self.rows[number, fields, names] = Rows(batch, targets, [*state, *out])
+        return self.rows[number, fields, names]
+
+
+class Rows(NamedTuple):
+    """Simulations, and their live arrays in the order of packed rows, [N, ...] each."""
+
+    batch: Batch
+    targets: list[np.ndarray]  # state, ctrl and changed fields of the model: what a row brings
+    sources: list[np.ndarray]  # state and readings: what a row takes away
 
 
 def _call_host(name: str, host: Callable, width: int, row: Array) -> Array:
@@ -129,10 +140,7 @@ def _run_rows(
     rows = np.asarray(rows)
     flat = rows.reshape(-1, rows.shape[-1])
     with engine.lock:
-        batch = engine.batch(len(flat), names)
-        targets = [batch.bind(name) for name in (*fields, "ctrl")]
-        targets += [batch.expand(name) for name in names]
-        sources = targets[: len(fields)] + [batch.bind(name) for name in engine.record._fields]
+        batch, targets, sources = engine.rows_of(len(flat), fields, names)
         bad = ~np.isfinite(flat).all(axis=1)
         _load(targets, flat, bad, engine.model)
         batch.warning[...] = 0
@@ -153,9 +161,11 @@ def _load(targets: list[np.ndarray], rows: np.ndarray, bad: np.ndarray, model) -
         rows = rows.copy()
         rows[bad] = 0.0
         rows[bad, : model.nq] = model.qpos0
-    ends = np.cumsum([math.prod(target.shape[1:]) for target in targets])
-    for target, columns in zip(targets, np.split(rows, ends[:-1], axis=1), strict=True):
-        target[...] = columns.reshape(target.shape)
+    end = 0
+    for target in targets:
+        begin, end = end, end + math.prod(target.shape[1:])
+        if end > begin:
+            target[...] = rows[:, begin:end].reshape(target.shape)
 
 
 def _advance(batch: Batch, stage: int, substeps: int) -> np.ndarray:
