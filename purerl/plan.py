@@ -10,14 +10,12 @@ and both behaviours are judged by both rewards and by every metric:
 """
 
 import dataclasses
-import sys
 import time
 from collections.abc import Sequence
 from typing import Any
 
-from purerl.core.errors import SUCCESS, USAGE, RunError, UserError
 from purerl.runs import output
-from purerl.runs.command_errors import leave, tell
+from purerl.runs.command_errors import leave
 
 PROG = "python -m purerl.plan"
 FRAME = (640, 480)  # of a video [pixels]
@@ -26,25 +24,10 @@ BOTH = ("these settings", "against")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    words = sys.argv[1:] if arguments is None else list(arguments)
-    try:
-        if not words or words[0] in ("-h", "--help"):
-            return _help(bool(words))
-        command(words)
-    except (UserError, RunError) as error:
-        return tell(error)
-    return SUCCESS
-
-
-def _help(asked: bool) -> int:
-    """Prints the page about the command; an experiment's own options are on the page of it."""
-    from purerl.runs.command_line import parse
     from purerl.tune.plan.problem import Options
+    from purerl.tune.subject import carry_out
 
-    output.show(*str(__doc__).split("\n"), f"Of the environment: {PROG} EXPERIMENT --help", "")
-    if asked:
-        parse(Options, ["--help"], PROG)
-    return USAGE
+    return carry_out(command, Options, __doc__, PROG, arguments)
 
 
 def command(words: Sequence[str]) -> None:

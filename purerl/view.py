@@ -1,35 +1,41 @@
 """Opens a window on a run or an experiment: `python -m purerl.view EXPERIMENT_OR_RUN`.
 
 A page in the browser in which a run's policy drives the body, live; an experiment's body, the
-planner. Sliders change the numbers of the environment's options. A run's folder is only read, and
-may be training meanwhile.
+planner. Sliders change the numbers of the environment's options, which begin as they are given:
+
+    python -m purerl.view suite --env.task hopper-hop
+
+A run's folder is only read, and may be training meanwhile.
 """
 
 import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Literal
-
-import tyro
+from typing import Literal
 
 from purerl.core.errors import UserError
 from purerl.runs.command_errors import leave
-from purerl.runs.command_line import carry_out
-from purerl.runs.options import PlayOptions
+from purerl.runs.options import check_seed
 from purerl.runs.output import show
 from purerl.tune.plan.settings import Settings
+from purerl.tune.subject import carry_out, chosen as settings_of, find
+
+PROG = "python -m purerl.view"
 
 
 @dataclass(frozen=True)
-class Options(Settings, PlayOptions):
-    """Opens a page in which a policy or the planner drives the body, with sliders."""
+class Options(Settings):
+    """Who drives the body, and where the page is."""
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """A run's folder, such as runs/ant_run/seed1, or an experiment, such as ant_gaps."""
     drive: Literal["", "policy", "planner"] = ""
     """Who chooses the actions; by default a run's policy, and the planner of an experiment. Of a
     run, plans correct its policy's actions, and its value counts at the horizon."""
+    seed: int = 0
+    """Seed of the episodes; never meets a seed of training."""
+    checkpoint: str = "latest"
+    """Of a run: latest, best (highest evaluation return), or an update's number."""
+    trust: bool = False
+    """Execute the run's experiment.py though this machine does not know it: read it first."""
     host: str = "127.0.0.1"
     """Where to listen. By default only this machine can open the page; over SSH, forward the port:
     ssh -L 8080:127.0.0.1:8080 MACHINE."""
@@ -38,13 +44,13 @@ class Options(Settings, PlayOptions):
 
     def __post_init__(self) -> None:
         """Checks the rules."""
-        Settings.__post_init__(self)
-        PlayOptions.__post_init__(self)
+        super().__post_init__()
+        check_seed(self.seed)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return carry_out(Options, command, "python -m purerl.view", arguments)
+    return carry_out(command, Options, __doc__, PROG, arguments)
 
 
 def has_viser() -> bool:
@@ -52,7 +58,7 @@ def has_viser() -> bool:
     return importlib.util.find_spec("viser") is not None
 
 
-def command(options: Options) -> None:
+def command(words: Sequence[str]) -> None:
     """Opens the page and plays until Ctrl-C."""
     if not has_viser():
         raise UserError(
@@ -62,8 +68,10 @@ def command(options: Options) -> None:
     from purerl.tune.view.loop import check_port, play
     from purerl.tune.view.page import Page
 
+    found = find(words, PROG)
+    chosen, options = settings_of(found, words[1:], f"{PROG} {found.name}", Options)
     check_port(options.host, options.port)
-    session, source, title = opening.open_window(options)
+    session, source, title = opening.open_window(found, chosen, options)
     page = Page(options.host, options.port, title)
     try:
         if options.port not in (0, page.port):  # viser takes the next one

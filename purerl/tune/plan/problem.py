@@ -1,21 +1,17 @@
-"""What is planned for: an experiment, or a run with what it has learned."""
+"""What is planned for: a subject under some settings, or the same under two."""
 
-import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import UserError
-from purerl.runs import experiment
 from purerl.runs.build_experiment import Setup, build
-from purerl.runs.command_line import from_command_line
-from purerl.runs.experiment import Source
 from purerl.runs.options import check_seed
+from purerl.tune import subject
 from purerl.tune.plan.settings import Settings
 
 AGAINST = "--against"
-SETTABLE = ("env", "engine")  # of an experiment's settings
 
 
 @dataclass(frozen=True)
@@ -69,11 +65,6 @@ class Problem(NamedTuple):
     learned: Any  # a run's TrainState; None: nothing
 
 
-def is_run(name: str) -> bool:
-    """Tells whether the command's first word names a run's folder, and not an experiment."""
-    return Path(name).is_dir()
-
-
 def read(words: Sequence[str], prog: str) -> tuple[Problem, Problem | None, Options]:
     """Reads a command line: what is planned for, and under which other settings too.
 
@@ -85,44 +76,22 @@ def read(words: Sequence[str], prog: str) -> tuple[Problem, Problem | None, Opti
     Raises:
       UserError: there is no such experiment, run or option, or a value is wrong.
     """
-    if not words or words[0].startswith("-"):
-        raise UserError(f"The first word must be an experiment or a run: {prog} EXPERIMENT_OR_RUN")
     words, after = list(words), None
     if AGAINST in words:
         place = words.index(AGAINST)
         words, after = words[:place], words[place + 1 :]
-    name, prog = words[0], f"{prog} {words[0]}"
-    source, learned = (_of_run if is_run(name) else _of_experiment)(words)
-    chosen, options = from_command_line(source, words[1:], prog, base=Options, names=SETTABLE)
-    problem = Problem(name, build(chosen), learned if options.policy else None)
+    found = subject.find(words, prog)
+    prog = f"{prog} {found.name}"
+    chosen, options = subject.chosen(found, words[1:], prog, Options)
+    learned = found.run.state if found.run is not None and options.policy else None
+    problem = Problem(found.name, build(chosen), learned)
     if after is None:
         return problem, None, options
-    source = source._replace(experiment=chosen)
-    other, _ = from_command_line(source, after, f"{prog} {AGAINST}", base=Nothing, names=("env",))
+    found = found._replace(source=found.source._replace(experiment=chosen))
+    other, _ = subject.chosen(found, after, f"{prog} {AGAINST}", Nothing, ("env",))
     if other.env == chosen.env:
         raise UserError(
             f"The settings after {AGAINST} are those before it: give what differs, such as "
             f"{prog} {AGAINST} --env.forward-weight 2."
         )
     return problem, problem._replace(setup=build(other)), options
-
-
-def _of_experiment(words: Sequence[str]) -> tuple[Source, None]:
-    return experiment.find_source(words[0]), None
-
-
-def _of_run(words: Sequence[str]) -> tuple[Source, Any]:
-    """Reads a run: the settings that can be given after it are its experiment's."""
-    from purerl.runs.loaded_run import load
-
-    early: Callable[..., Any] = argparse.ArgumentParser
-    parser = early(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument("--checkpoint", default="latest")
-    parser.add_argument("--trust", action="store_true")
-    try:
-        known, _ = parser.parse_known_args(words[1:])
-    except argparse.ArgumentError as error:
-        raise UserError(f"The command line is wrong: {error}.") from error
-    run = load(words[0], known.checkpoint, trust=known.trust)
-    file = Path(words[0]) / "experiment.py"
-    return Source(run.experiment, words[0], file), run.state

@@ -13,10 +13,11 @@ from purerl.devices.compilation import set_up_jax
 from purerl.runs import checkpoint_folder, experiment, files
 from purerl.runs.build_experiment import Setup, build
 from purerl.runs.experiment import Experiment
-from purerl.runs.loaded_run import Run, load
+from purerl.runs.loaded_run import Run
 from purerl.runs.output import show
 from purerl.runs.restored_run import read_checkpoint
 from purerl.tune.plan import planner
+from purerl.tune.subject import Subject
 from purerl.tune.view import overrides
 from purerl.tune.view.drivers import Driver, planner_driver, policy_driver
 from purerl.tune.view.option_numbers import replaced
@@ -38,20 +39,26 @@ class Source(NamedTuple):
     command: Callable[[Numbers], str]
 
 
-def open_window(options: Any) -> tuple[Session, Source, str]:
-    """Reads a run or an experiment, as the command's options name it.
+def open_window(subject: Subject, chosen: Experiment, options: Any) -> tuple[Session, Source, str]:
+    """Opens an experiment, or a run.
+
+    Args:
+      subject: what the command names.
+      chosen: its experiment, with the settings that the command gives.
+      options: of the command.
 
     Returns:
       The session at its start, the source of the rest, and the page's title.
 
     Raises:
-      UserError: it is neither, or its environment cannot be drawn.
+      UserError: its environment cannot be drawn, or there is no policy to drive.
     """
-    return (_of_run if options.run.is_dir() else _of_experiment)(options)
+    if subject.run is None:
+        return _of_experiment(subject, chosen, options)
+    return _of_run(subject.run, chosen, options)
 
 
-def _of_run(options: Any) -> tuple[Session, Source, str]:
-    run = load(options.run, options.checkpoint, options.engine, options.trust)
+def _of_run(run: Run, chosen: Experiment, options: Any) -> tuple[Session, Source, str]:
     setup, brain = run.restored.setup, jax.device_put(run.state)
     guide = functools.partial(planner.guide, setup.config, setup.network)
     if options.drive == "planner":
@@ -64,7 +71,7 @@ def _of_run(options: Any) -> tuple[Session, Source, str]:
         return jax.device_put(saved.state), _words(saved.meta["update"], saved.meta["steps"])
 
     written = run.restored.source.experiment
-    source = _source(setup, driver, brain, written, run.experiment, command_name(run))
+    source = _source(setup, driver, brain, written, chosen, command_name(run))
     source = source._replace(
         brain=other_brain,
         checkpoints=lambda: checkpoint_names(run.folder, options.checkpoint),
@@ -74,15 +81,16 @@ def _of_run(options: Any) -> tuple[Session, Source, str]:
     return _open(source, setup, brain, words, options), source, title
 
 
-def _of_experiment(options: Any) -> tuple[Session, Source, str]:
+def _of_experiment(
+    subject: Subject, chosen: Experiment, options: Any
+) -> tuple[Session, Source, str]:
     if options.drive == "policy":
-        raise UserError(f"{options.run} is no run's folder: an experiment has no policy to drive.")
+        raise UserError(f"{subject.name} is no run's folder: an experiment has no policy to drive.")
     set_up_jax(cache=True)
-    found = experiment.find_source(str(options.run))
-    setup, name = build(found.experiment), str(options.run)
+    setup, written = build(chosen), subject.source.experiment
     driver = planner_driver(options, lambda _: planner.unguided(setup.env.action_size), ())
-    source = _source(setup, driver, (), found.experiment, found.experiment, name)
-    return _open(source, setup, (), _plans(options), options), source, found.name
+    source = _source(setup, driver, (), written, chosen, subject.name)
+    return _open(source, setup, (), _plans(options), options), source, subject.source.name
 
 
 def _source(

@@ -17,6 +17,7 @@ from PIL import Image
 
 from purerl import UserError, load, run as train, view
 from purerl.core.errors import USAGE
+from purerl.tune import subject
 from purerl.tune.plan import planner
 from purerl.tune.view import opening
 from purerl.tune.view.drivers import policy_driver
@@ -41,6 +42,12 @@ def trained(tmp_path_factory) -> Path:
     words = [sled.__file__, "--runs", str(place), "--name", "one", "--checkpoints", "3"]
     assert train.main(words) == 0
     return place / "sled_experiment" / "one"
+
+
+def open_with(options, name: Path, *words: str):
+    found = subject.find([str(name)], view.PROG)
+    chosen, _ = subject.chosen(found, words, view.PROG, view.Options)
+    return opening.open_window(found, chosen, options)
 
 
 def only_line(capsys) -> str:
@@ -115,8 +122,8 @@ def test_an_environment_without_options_has_no_sliders(made):
 @pytest.mark.slow
 def test_the_planner_drives_an_experiment(trained):
     """By the best of its plans: to be still at x = 0 costs least, and a push is braked."""
-    options = view.Options(run=Path(sled.__file__), samples=32, horizon=10, seed=1)
-    session, source, title = opening.open_window(options)
+    options = view.Options(samples=32, horizon=10, seed=1)
+    session, source, title = open_with(options, Path(sled.__file__))
     assert title == "sled_experiment" and source.checkpoints() == ()
     session = advance(session, [Push((1.0, 0.0, 0.0)), Step()])
     for _ in range(40):
@@ -125,14 +132,25 @@ def test_the_planner_drives_an_experiment(trained):
     assert speeds[0] > 0.9 and speeds[-1] < 0.5 * speeds[0]
     assert all(row.action[0] < 0 for row in session.rows[:5])
     # Of a run, plans begin with what the policy does.
-    of_run = view.Options(run=trained, drive="planner", samples=8, horizon=2)
-    session, source, _ = opening.open_window(of_run)
+    of_run = view.Options(drive="planner", samples=8, horizon=2)
+    session, source, _ = open_with(of_run, trained)
     assert take_step(session).length == 1
     assert source.command({("bonus",): 2.0}).endswith("sled_experiment.py --env.bonus 2.0")
     assert source.words({("span", 0): 1.0}) == source.command({("span", 0): 1.0})
     assert source.words({("span", 0): 1.0}) == "span is (1.0, 1.0); give least < greatest."
     with pytest.raises(UserError, match="is no run's folder"):
-        opening.open_window(dataclasses.replace(options, drive="policy"))
+        open_with(dataclasses.replace(options, drive="policy"), Path(sled.__file__))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("of", ["experiment", "run"])
+def test_the_sliders_begin_where_the_command_line_puts_them(trained, of):
+    name = trained if of == "run" else Path(sled.__file__)
+    options = view.Options(samples=8, horizon=2)
+    session, source, _ = open_with(options, name, "--env.bonus", "3", "--env.width", "0.25")
+    assert session.numbers[("bonus",)] == 3.0 and session.numbers[("width",)] == 0.25
+    assert take_step(session).rows[-1].metrics["reward_bonus"] == 3.0
+    assert source.words(session.numbers) == "--env.bonus 3.0 --env.width 0.25"
 
 
 @pytest.mark.slow

@@ -1,0 +1,97 @@
+"""What is planned for or looked at: an experiment, or a run with what it has learned."""
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from purerl.core.errors import SUCCESS, USAGE, RunError, UserError
+from purerl.runs import experiment, output
+from purerl.runs.command_errors import tell
+from purerl.runs.command_line import from_command_line, parse
+from purerl.runs.experiment import Experiment, Source
+from purerl.runs.loaded_run import Run, load
+
+SETTABLE = ("env", "engine")  # of an experiment's settings
+
+
+class Subject(NamedTuple):
+    """What a command's first word names."""
+
+    name: str  # the word
+    source: Source  # the experiment, a run's with the run's settings
+    run: Run | None  # if it is one
+
+
+def carry_out(
+    command: Callable[[Sequence[str]], None],
+    base: Any,
+    about: str | None,
+    prog: str,
+    arguments: Sequence[str] | None,
+) -> int:
+    """Runs a command whose first word is a subject; returns its exit code.
+
+    Args:
+      command: is called with the words.
+      base: the dataclass of its options.
+      about: of the command, for its help page. The options of an environment are on the page that
+        the command has for it.
+      prog: the command's own words.
+      arguments: the command line; None: this process's.
+    """
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        if words and words[0] not in ("-h", "--help"):
+            command(words)
+            return SUCCESS
+        output.show(*str(about).split("\n"), f"Of the environment: {prog} EXPERIMENT --help", "")
+        if words:
+            parse(base, ["--help"], prog)
+        return USAGE
+    except (UserError, RunError) as error:
+        return tell(error)
+
+
+def find(words: Sequence[str], prog: str) -> Subject:
+    """Finds what the first of the words names.
+
+    Raises:
+      UserError: there is no such experiment or run.
+    """
+    if not words or words[0].startswith("-"):
+        raise UserError(f"The first word must be an experiment or a run: {prog} EXPERIMENT_OR_RUN")
+    name = words[0]
+    if not Path(name).is_dir():
+        return Subject(name, experiment.find_source(name), None)
+    # Options that say how to read the run, whose experiment says which other options there are.
+    early: Callable[..., Any] = argparse.ArgumentParser
+    parser = early(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--checkpoint", default="latest")
+    parser.add_argument("--engine", default="")
+    parser.add_argument("--trust", action="store_true")
+    try:
+        known, _ = parser.parse_known_args(words[1:])
+    except argparse.ArgumentError as error:
+        raise UserError(f"The command line is wrong: {error}.") from error
+    run = load(name, known.checkpoint, known.engine, known.trust)
+    return Subject(name, Source(run.experiment, name, Path(name) / "experiment.py"), run)
+
+
+def chosen(
+    subject: Subject, words: Sequence[str], prog: str, base: Any, names: Sequence[str] = SETTABLE
+) -> tuple[Experiment, Any]:
+    """Returns the subject's experiment with the settings that the words give, and the options.
+
+    Args:
+      subject: the subject.
+      words: the command line after its name.
+      prog: the command before them, for errors.
+      base: the dataclass of the command's options.
+      names: of the settings that can be given.
+
+    Raises:
+      UserError: there is no such option, or a value is wrong.
+    """
+    return from_command_line(subject.source, words, prog, base=base, names=names)
