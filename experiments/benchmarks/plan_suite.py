@@ -20,6 +20,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from envs.suite.tasks import TASKS, Options as SuiteOptions
@@ -31,7 +32,7 @@ from purerl.runs.experiment import Experiment, available, find
 from purerl.runs.loaded_run import load
 from purerl.tune.plan import episodes, planner
 from purerl.tune.plan.figures import said
-from purerl.tune.plan.settings import Settings
+from purerl.tune.plan.settings import NO_SEARCH, Settings
 
 MUST_SHOW = ("cartpole-swingup", "walker-walk", "cheetah-run", "hopper-hop", "humanoid-stand")
 # The cart hits its end 2 s after what set it on its way there; the control step is 10 ms.
@@ -59,13 +60,9 @@ def limit_of(task: str) -> int:
 
 
 def settings_of(task: str, name: str) -> Settings:
-    """Returns a planner's settings for a task by its name, with "+policy" or without.
-
-    "policy" is no search: the first two samples are the plan, at first 0, and 0, and there are no
-    more.
-    """
+    """Returns a planner's settings for a task by its name, with "+policy" or without."""
     if name == "policy":
-        return Settings(samples=2, elites=2, horizon=1, knots=2)
+        return Settings(**NO_SEARCH)
     kind: Any = name.removesuffix("+policy")
     return dataclasses.replace(Settings(kind), **OTHER_SETTINGS.get(task, {}))
 
@@ -85,8 +82,8 @@ def play(task: str, name: str, steps: int, seed: int, number: int) -> list[dict]
     learned = run.state if run and name.endswith("policy") else None
     game = episodes.episodes(config, settings_of(task, name), env, guide, learned, seed, number)
     times = []
-    for playing, _ in game:
-        end = playing
+    for playing, rows in game:
+        end, _ = jax.block_until_ready((playing, rows))
         times.append(time.perf_counter())
     # The first call was compiling.
     rate = (len(times) - 1) * episodes.CHUNK * number / max(times[-1] - times[0], 1e-9)

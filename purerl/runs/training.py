@@ -148,8 +148,12 @@ def _runs_on_gpu() -> bool:
 
 
 @contextmanager
-def stop_signals(end: Callable[[int], Any]) -> Iterator[Callable[[], bool]]:
+def stop_signals(
+    end: Callable[[int], Any], then: str = "finishing this chunk, then saving"
+) -> Iterator[Callable[[], bool]]:
     """Yields a question: did SIGTERM or SIGINT ask to stop? A second signal calls `end(exit code)`.
+
+    `then` is what is told at the first.
 
     Only the main thread receives signals: in another one the answer is always no.
     """
@@ -161,7 +165,7 @@ def stop_signals(end: Callable[[int], Any]) -> Iterator[Callable[[], bool]]:
             return
         received.append(number)
         name = signal.Signals(number).name
-        output.warn(f"\n{name}: finishing this chunk, then saving. Once more to stop at once.")
+        output.warn(f"\n{name}: {then}. Once more to stop at once.")
 
     old = {}
     if threading.current_thread() is threading.main_thread():

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from purerl.core.errors import SUCCESS, USAGE, RunError, UserError
+from purerl.core.errors import SUCCESS, USAGE, RunError, StoppedError, UserError
 from purerl.runs import experiment, output
 from purerl.runs.command_errors import tell
 from purerl.runs.command_line import from_command_line, parse
@@ -50,7 +50,7 @@ def carry_out(
         if words:
             parse(base, ["--help"], prog)
         return USAGE
-    except (UserError, RunError) as error:
+    except (UserError, RunError, StoppedError) as error:
         return tell(error)
 
 

@@ -19,6 +19,7 @@ from purerl.tune.plan import planner
 from purerl.tune.plan.planner import Guide, Plan
 from purerl.tune.plan.settings import Settings
 
+TERM = "reward_"  # the name of a metric that is a term of the reward begins so
 CHUNK = 20  # control steps that one call of the program plays
 
 
@@ -61,8 +62,8 @@ def advance(
     Args:
       settings: of the planner.
       env: the environment.
-      judges: name -> the environment under other settings: each gives the reward that it would
-        have given for the same action in the same state.
+      judges: name -> the environment under some settings: each gives the reward, and its terms
+        (metrics named `reward_*`), that it would have given for the same action in the same state.
       keep: what to keep of each state, before the step; of one environment.
       guide: see `planner.plan`.
       key: [] typed, of all steps.
@@ -78,7 +79,7 @@ def advance(
     choose = functools.partial(planner.plan, settings, env, guide)
     plans, action = jax.vmap(choose)(playing.plan, now.env, keys)
     following = evaluation.advance(env, now, action, ())
-    judged = {name: jax.vmap(judge.step)(now.env, action).reward for name, judge in judges.items()}
+    judged = {name: judge_step(judge, now.env, action) for name, judge in judges.items()}
     row = {
         "running": ~(now.over | following.lost),
         "kept": jax.vmap(keep)(now.env),
@@ -88,6 +89,13 @@ def advance(
         "judged": judged,
     }
     return Playing(following, plans), row
+
+
+def judge_step(judge: Env, state: State, action: Array) -> dict[str, Array]:
+    """Returns the reward, as "return", and its terms that a judge gives for one step, [E] each."""
+    found = jax.vmap(judge.step)(state, action)
+    terms = {name: x for name, x in found.metrics.items() if name.startswith(TERM)}
+    return {"return": found.reward} | terms
 
 
 def episodes(
@@ -101,9 +109,10 @@ def episodes(
     judges: Mapping[str, Env] | None = None,
     keep: Callable[[State], Any] = lambda state: (),
 ) -> Iterator[tuple[Playing, dict[str, Any]]]:
-    """Plays E whole episodes; yields them and numpy arrays [T, E, ...] after every few steps.
+    """Plays E whole episodes; yields them and arrays [T, E, ...] after every few steps.
 
-    Two programs are compiled: the beginning, and `CHUNK` control steps, each with its plan.
+    What it yields may still be being computed. Two programs are compiled: the beginning, and
+    `CHUNK` control steps, each with its plan.
 
     Args:
       config: for the time limit.
@@ -130,7 +139,7 @@ def episodes(
     playing, go_on = jit("plan_start", first)(learned, reset_key), jit("plan", chunk)
     while True:
         playing, rows = go_on(learned, key, playing)
-        yield playing, jax.device_get(rows)
+        yield playing, rows
         if bool(np.all(playing.progress.over)):
             return
 

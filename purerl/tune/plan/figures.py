@@ -9,18 +9,19 @@ from typing import Any
 import numpy as np
 
 from purerl.report.bootstrap import LEAST_RUNS, mean_interval
+from purerl.tune.plan.episodes import TERM
 
 Figures = dict[str, np.ndarray]  # name -> [E]
-RETURN = "episode_return"
+RETURN, LENGTH, LOST = "episode_return", "episode_length", "lost"
 
 
 def table(groups: Mapping[str, Figures]) -> list[str]:
-    """Returns lines with mean and 95% interval of every figure, the return first.
+    """Returns lines with mean and 95% interval of every figure, returns first.
 
     With two groups, the episodes of which begin alike, also of the difference, episode by episode.
     """
     first, *rest = groups.values()
-    names = dict.fromkeys([RETURN, *sorted(set(first).union(*rest))])
+    names = sorted(set(first).union(*rest), key=lambda name: ("return" not in name, name))
     columns = {name: [said(group.get(row)) for row in names] for name, group in groups.items()}
     if rest:
         columns["difference"] = [
@@ -30,9 +31,24 @@ def table(groups: Mapping[str, Figures]) -> list[str]:
     lines = [["", *columns], *([n, *row] for n, *row in zip(names, *columns.values(), strict=True))]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     cells = [[f"{x:>{w}}" for x, w in zip(line, widths, strict=True)] for line in lines]
-    printed = ["  ".join([row[0].strip().ljust(widths[0]), *row[1:]]) for row in cells]
-    few = len(first[RETURN]) < LEAST_RUNS
-    return printed + [f"Intervals need {LEAST_RUNS} episodes: --episodes {LEAST_RUNS}"] * few
+    return ["  ".join([row[0].strip().ljust(widths[0]), *row[1:]]).rstrip() for row in cells]
+
+
+def notes(groups: Mapping[str, Figures]) -> list[str]:
+    """Returns lines that say how to read a table, and what is wrong with its episodes."""
+    lines = ["Returns are sums over an episode, other rows means over its steps (*_count: sums)."]
+    number = len(next(iter(groups.values()))[LENGTH])
+    if number < LEAST_RUNS:
+        lines.append(f"Intervals need {LEAST_RUNS} episodes: --episodes {LEAST_RUNS}")
+    for name, group in groups.items():
+        if lost := int(group[LOST].sum()):
+            lines.append(
+                f"{name}: {lost} of {number} episodes were lost (a number was NaN or absurd) and "
+                "count 0: `python -m purerl.check` says which number."
+            )
+        elif (group[LENGTH] <= 1).all():
+            lines.append(f"{name}: every episode ended with its first step.")
+    return lines
 
 
 def said(values: np.ndarray | None) -> str:
@@ -51,7 +67,7 @@ def rows(groups: Mapping[str, Figures]) -> str:
     writer = csv.DictWriter(written, ["settings", "episode", *names], lineterminator="\n")
     writer.writeheader()
     for group, figures in groups.items():
-        for episode in range(len(figures[RETURN])):
+        for episode in range(len(figures[LENGTH])):
             values = {name: float(values[episode]) for name, values in figures.items()}
             writer.writerow({"settings": group, "episode": episode} | values)
     return written.getvalue()
@@ -70,13 +86,27 @@ def as_json(groups: Mapping[str, Figures], about: Mapping[str, Any]) -> str:
 
 
 def judged(rows: Sequence[Mapping[str, Any]]) -> Figures:
-    """Returns each judge's return of the episodes, of the rows of `episodes.advance`."""
-    return {
-        f"return under {name}": total(
-            np.where(row["running"], row["judged"][name], 0.0) for row in rows
-        )
-        for name in rows[0]["judged"]
-    }
+    """Returns what each judge says of the episodes, of the rows of `episodes.advance`.
+
+    The return is a sum over an episode, its terms are means over the steps, as metrics are.
+    """
+    steps = np.maximum(total(row["running"] for row in rows), 1.0)
+    found = {}
+    for judge, parts in rows[0]["judged"].items():
+        for part in parts:
+            whole = total(np.where(row["running"], row["judged"][judge][part], 0.0) for row in rows)
+            found[f"{part} under {judge}"] = whole if part == "return" else whole / steps
+    return found
+
+
+def compared(own: Figures, judged: Figures) -> Figures:
+    """Returns the figures that two behaviours can be compared by.
+
+    Of the return and of the terms of a reward, those that both settings judge: the weights of two
+    settings are no difference between behaviours.
+    """
+    shared = {n: x for n, x in own.items() if n != RETURN and not n.startswith(TERM)}
+    return shared | judged if judged else own
 
 
 def total(parts: Iterable[np.ndarray]) -> np.ndarray:

@@ -18,9 +18,9 @@ def keep_picture(env: Env) -> Callable[[State], Any]:
     return lambda state: take_picture(env, state)
 
 
-def keep_nothing(state: State) -> Any:
-    """Keeps nothing of a state."""
-    return ()
+def keep_observation(state: State) -> Any:
+    """Keeps what is observed of a state: episodes that begin alike are known by it."""
+    return state.observation
 
 
 def film(

@@ -1,5 +1,7 @@
 """What is planned for: a subject under some settings, or the same under two."""
 
+import dataclasses
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,11 +9,15 @@ from typing import Any, NamedTuple
 
 from purerl.core.errors import UserError
 from purerl.runs.build_experiment import Setup, build
+from purerl.runs.experiment import Experiment
 from purerl.runs.options import check_seed
 from purerl.tune import subject
+from purerl.tune.overrides import environment_words
 from purerl.tune.plan.settings import Settings
+from purerl.tune.subject import Subject
 
 AGAINST = "--against"
+BOTH = ("first", "second")  # the settings before it, and after it
 
 
 @dataclass(frozen=True)
@@ -24,8 +30,9 @@ class Options(Settings):
     """Control steps of an episode at most; 0: the experiment's time limit."""
     seed: int = 0
     """Seed of the episodes and the plans: episodes begin as those of `evaluate`."""
-    policy: bool = True
-    """Of a run: plans correct its policy's actions, and its value counts at the horizon."""
+    no_policy: bool = False
+    """Of a run: plan as if nothing were learned. By default, plans correct its policy's actions,
+    and what its value says of a plan's last state counts."""
     checkpoint: str = "latest"
     """Of a run: latest, best (highest evaluation return), or an update's number."""
     trust: bool = False
@@ -46,8 +53,16 @@ class Options(Settings):
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}.")
         for name in ("csv", "json", "video"):
             file = getattr(self, name)
-            if file is not None and (file.is_dir() or not file.absolute().parent.is_dir()):
-                raise ValueError(f"{name} is {file}; it must be a file in a folder that exists.")
+            if file is None:
+                continue
+            if file.is_dir():
+                raise ValueError(f"{name} is {file}, a folder; it must be a file.")
+            if not os.access(file.absolute().parent, os.W_OK):
+                raise ValueError(
+                    f"{name} is {file}; it must be a file in a folder that exists and is yours."
+                )
+        if self.csv is not None and self.csv == self.json:
+            raise ValueError(f"csv and json are both {self.csv}; they must be two files.")
         if self.video is not None and self.video.suffix != ".mp4":
             raise ValueError(f"video is {self.video}; its name must end in .mp4.")
 
@@ -61,8 +76,12 @@ class Problem(NamedTuple):
     """What is planned for."""
 
     name: str
+    title: str  # of its column
+    words: str  # the settings of the environment that are not those of the experiment's file
+    env: Any  # these settings
     setup: Setup
     learned: Any  # a run's TrainState; None: nothing
+    trained: str  # what of a run that is, in words
 
 
 def read(words: Sequence[str], prog: str) -> tuple[Problem, Problem | None, Options]:
@@ -70,7 +89,7 @@ def read(words: Sequence[str], prog: str) -> tuple[Problem, Problem | None, Opti
 
     Args:
       words: an experiment or a run, options, and after `--against` other settings of the
-        environment.
+        environment, beside those before it.
       prog: the command, for errors.
 
     Raises:
@@ -83,15 +102,58 @@ def read(words: Sequence[str], prog: str) -> tuple[Problem, Problem | None, Opti
     found = subject.find(words, prog)
     prog = f"{prog} {found.name}"
     chosen, options = subject.chosen(found, words[1:], prog, Options)
-    learned = found.run.state if found.run is not None and options.policy else None
-    problem = Problem(found.name, build(chosen), learned)
+    if found.run is None and (options.no_policy or options.checkpoint != Options.checkpoint):
+        raise UserError(
+            f"{found.name} is an experiment, which has no policy and no checkpoints: --no-policy "
+            "and --checkpoint are for a run's folder."
+        )
+    first = _problem(found, chosen, options)
     if after is None:
-        return problem, None, options
-    found = found._replace(source=found.source._replace(experiment=chosen))
-    other, _ = subject.chosen(found, after, f"{prog} {AGAINST}", Nothing, ("env",))
+        return first, None, options
+    _check_after(after, found, prog)
+    begin = found._replace(source=found.source._replace(experiment=chosen))
+    other, _ = subject.chosen(begin, after, f"{prog} {AGAINST}", Nothing, ("env",))
     if other.env == chosen.env:
         raise UserError(
-            f"The settings after {AGAINST} are those before it: give what differs, such as "
-            f"{prog} {AGAINST} --env.forward-weight 2."
+            f"The settings after {AGAINST} are those before it: give what differs "
+            f"({_example(chosen.env)})."
         )
-    return problem, problem._replace(setup=build(other)), options
+    both = (first, _problem(found, other, options))
+    first, second = (one._replace(title=title) for one, title in zip(both, BOTH, strict=True))
+    return first, second, options
+
+
+def _problem(found: Subject, chosen: Experiment, options: Options) -> Problem:
+    run = None if options.no_policy else found.run
+    written = found.source if found.run is None else found.run.restored.source
+    return Problem(
+        name=found.name,
+        title=options.planner if run is None else f"{options.planner} + policy",
+        words=" ".join(environment_words(written.experiment, chosen.env)),
+        env=chosen.env,
+        setup=build(chosen),
+        learned=None if run is None else run.state,
+        trained="" if run is None else f"update {run.update:,} ({run.steps:,} steps)",
+    )
+
+
+def _check_after(after: Sequence[str], found: Subject, prog: str) -> None:
+    """Raises UserError for what cannot stand after `--against`."""
+    if not after:
+        raise UserError(
+            f"Nothing stands after {AGAINST}: give other settings of the environment "
+            f"({_example(found.source.experiment.env)})."
+        )
+    mine = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(Options)}
+    wrong = next((word for word in after if word.split("=")[0] in mine | {"--engine"}), None)
+    if wrong:
+        raise UserError(
+            f"{wrong} stands after {AGAINST}, where only settings of the environment (--env...) "
+            f"stand; everything else comes before it: {prog} {wrong} ... {AGAINST} ..."
+        )
+
+
+def _example(env: Any) -> str:
+    """Returns a setting of an environment as an example."""
+    names = [f.name for f in dataclasses.fields(env)] if dataclasses.is_dataclass(env) else []
+    return f"--env.{names[0].replace('_', '-')} ..." if names else "--env.NAME ..."

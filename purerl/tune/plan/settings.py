@@ -1,7 +1,10 @@
 """The settings of a planner: pure data, checked when made."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
+
+# The first sample is the plan itself, which begins as 0, and the second is 0: what a policy does.
+NO_SEARCH: dict[str, Any] = {"samples": 2, "elites": 2, "horizon": 1, "knots": 2}
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ from purerl.runs.experiment import Experiment
 from purerl.runs.loaded_run import Run
 from purerl.runs.output import show
 from purerl.runs.restored_run import read_checkpoint
+from purerl.tune import overrides
 from purerl.tune.plan import planner
 from purerl.tune.subject import Subject
-from purerl.tune.view import overrides
 from purerl.tune.view.drivers import Driver, planner_driver, policy_driver
 from purerl.tune.view.option_numbers import replaced
 from purerl.tune.view.program import Numbers, build_program

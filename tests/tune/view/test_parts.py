@@ -13,7 +13,8 @@ from purerl import UserError
 from purerl.report.episode_pictures import Picture
 from purerl.runs.command_line import from_command_line
 from purerl.runs.experiment import find_source
-from purerl.tune.view import loop, opening, overrides, push, shapes
+from purerl.tune import overrides
+from purerl.tune.view import loop, opening, push, shapes
 from purerl.tune.view.option_numbers import bounds, label, numbers_of, replaced
 
 # --- numbers ---

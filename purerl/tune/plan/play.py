@@ -1,0 +1,95 @@
+"""Episodes that the command plans: telling how it goes, stopping when asked to."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+
+from purerl.core.errors import StoppedError
+from purerl.runs import output
+from purerl.runs.build_experiment import blame
+from purerl.runs.user_code import told
+from purerl.tune.plan import episodes, figures, planner
+from purerl.tune.plan.filming import film, keep_observation, keep_picture
+
+FRAME = (640, 480)  # of a video [pixels]
+SAY = 10.0  # between two lines about how it goes [s]
+WAIT = 0.02  # between two looks for a signal [s]
+
+
+class Played(NamedTuple):
+    """Episodes that have been played."""
+
+    figures: dict[str, Any]  # name -> [E]
+    judged: dict[str, Any]  # the judges' figures
+    starts: Any  # how the episodes began, for a comparison
+
+
+def play(problem: Any, options: Any, judges: dict[str, Any], stop: Callable[[], bool]) -> Played:
+    """Plays episodes, telling how it goes.
+
+    Args:
+      problem: what is planned for.
+      options: of the command.
+      judges: see `episodes.advance`.
+      stop: tells whether a signal asked to stop.
+
+    Raises:
+      StoppedError: one did.
+    """
+    config, env, network, _ = problem.setup
+    limit = options.steps or config.episode_length
+    config = dataclasses.replace(config, episode_length=limit)
+
+    def guide(learned: Any) -> planner.Guide:
+        if learned is None:
+            return planner.unguided(env.action_size)
+        return planner.guide(config, network, learned)
+
+    keep = keep_picture(env) if options.video else keep_observation
+    game = (config, options, env, guide, problem.learned, options.seed, options.episodes)
+    rows: list[Any] = []
+    begin = spoke = time.perf_counter()
+    with told(""), blame(env):
+        for now, computed in episodes.episodes(*game, judges, keep):
+            wait(computed, stop)
+            rows.append(jax.device_get(computed))
+            clock = time.perf_counter()
+            if len(rows) == 1:
+                begin = clock  # what came before was compiling
+            said = progress(problem.title, now, limit, clock - begin, len(rows))
+            if stop():
+                raise StoppedError(f"Stopped ({said}): no figures, and no file was written.")
+            if clock - spoke > SAY:
+                spoke = clock
+                output.say(said)
+    if options.video is not None:
+        name = f"{options.video.stem}_{problem.title}" if judges else options.video.stem
+        path = options.video.with_name(f"{name}.mp4")
+        film(path, env, FRAME, now, rows)
+        output.say(str(path))
+    starts = jax.tree.map(lambda x: x[0], rows[0]["kept"])
+    return Played(episodes.results(now), figures.judged(rows), starts)
+
+
+def wait(arrays: Any, stop: Callable[[], bool]) -> None:
+    """Waits for arrays that are being computed; a second signal then ends the process at once.
+
+    While Python waits inside JAX, no signal reaches it.
+    """
+    while not all(x.is_ready() for x in jax.tree.leaves(arrays)):
+        time.sleep(WAIT)
+        stop()
+
+
+def progress(title: str, playing: Any, limit: int, seconds: float, calls: int) -> str:
+    """Returns a line about episodes that are being played."""
+    done = playing.progress
+    number, steps = len(done.over), min(int(done.t), limit)
+    rate = (calls - 1) * episodes.CHUNK * number / max(seconds, 1e-9)
+    return (
+        f"{title}: step {steps:,} of {limit:,}, return so far "
+        f"{float(done.episode.episode_return.mean()):.4g}, {rate:.1f} steps planned/s"
+    )
