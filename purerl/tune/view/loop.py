@@ -1,5 +1,6 @@
 """The window's clock: plays the session in real time, and has slow work done beside it."""
 
+import errno
 import socket
 import time
 from collections.abc import Callable
@@ -25,16 +26,18 @@ LOOK = 2.0  # between two looks for new checkpoints [s]
 
 def check_port(host: str, port: int) -> None:
     """Raises UserError unless the port can be listened on."""
+    if not 0 <= port < 2**16:
+        raise UserError(f"port is {port}; it must be 0 to 65535.")
     try:
         with socket.socket() as one:
             one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             one.bind((host, port))
-    except (OSError, OverflowError) as error:
-        why = getattr(error, "strerror", None) or one_line(error)
-        raise UserError(
-            f"{host}:{port} cannot be listened on ({why}): give another, as "
-            f"--port {port % 60000 + 1}."
-        ) from error
+    except OSError as error:
+        elsewhere = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
+        cure = "an address of this machine, as --host 127.0.0.1"
+        cure = cure if elsewhere else f"another, as --port {port % 60000 + 1}"
+        why = error.strerror or one_line(error)
+        raise UserError(f"{host}:{port} cannot be listened on ({why}): give {cure}.") from error
 
 
 class Beside:

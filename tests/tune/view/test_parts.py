@@ -187,6 +187,10 @@ def test_a_port_in_use_is_one_line():
     loop.check_port("127.0.0.1", 0)
     with pytest.raises(UserError, match="nowhere.invalid:1"):
         loop.check_port("nowhere.invalid", 1)
+    with pytest.raises(UserError, match=r"\): give an address of this machine, as --host"):
+        loop.check_port("203.0.113.1", 1)
+    with pytest.raises(UserError, match="port is 99999; it must be 0 to 65535"):
+        loop.check_port("127.0.0.1", 99999)
 
 
 def test_checkpoints_of_a_folder_that_is_gone(tmp_path):
