@@ -15,37 +15,24 @@ from typing import Literal
 
 from purerl.core.errors import UserError
 from purerl.runs.command_errors import leave
-from purerl.runs.options import check_seed
 from purerl.runs.output import show
-from purerl.tune.plan.settings import Settings
-from purerl.tune.subject import carry_out, chosen as settings_of, find
+from purerl.tune.subject import PlanOptions, carry_out, chosen as settings_of, find
 
 PROG = "python -m purerl.view"
 
 
 @dataclass(frozen=True)
-class Options(Settings):
+class Options(PlanOptions):
     """Who drives the body, and where the page is."""
 
     drive: Literal["", "policy", "planner"] = ""
     """Who chooses the actions; by default a run's policy, and the planner of an experiment. Of a
     run, plans correct its policy's actions, and its value counts at the horizon."""
-    seed: int = 0
-    """Seed of the episodes; never meets a seed of training."""
-    checkpoint: str = "latest"
-    """Of a run: latest, best (highest evaluation return), or an update's number."""
-    trust: bool = False
-    """Execute the run's experiment.py though this machine does not know it: read it first."""
     host: str = "127.0.0.1"
     """Where to listen. By default only this machine can open the page; over SSH, forward the port:
     ssh -L 8080:127.0.0.1:8080 MACHINE."""
     port: int = 8080
     """The port to listen on."""
-
-    def __post_init__(self) -> None:
-        """Checks the rules."""
-        super().__post_init__()
-        check_seed(self.seed)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -3,17 +3,38 @@
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import SUCCESS, USAGE, RunError, StoppedError, UserError
-from purerl.runs import experiment, output
+from purerl.runs import experiment as experiments, output
 from purerl.runs.command_errors import tell
 from purerl.runs.command_line import from_command_line, parse
 from purerl.runs.experiment import Experiment, Source
 from purerl.runs.loaded_run import Run, load
+from purerl.runs.options import check_seed
+from purerl.tune.plan.settings import Settings
 
 SETTABLE = ("env", "engine")  # of an experiment's settings
+
+
+@dataclass(frozen=True)
+class PlanOptions(Settings):
+    """How plans are made, and which episodes they are for."""
+
+    seed: int = 0
+    """Seed of the episodes and of the plans; episodes begin as those of `evaluate`, and never meet
+    a seed of training."""
+    checkpoint: str = "latest"
+    """Of a run: latest, best (highest evaluation return), or an update's number."""
+    trust: bool = False
+    """Execute the run's experiment.py though this machine does not know it: read it first."""
+
+    def __post_init__(self) -> None:
+        """Checks the rules."""
+        super().__post_init__()
+        check_seed(self.seed)
 
 
 class Subject(NamedTuple):
@@ -64,7 +85,7 @@ def find(words: Sequence[str], prog: str) -> Subject:
         raise UserError(f"The first word must be an experiment or a run: {prog} EXPERIMENT_OR_RUN")
     name = words[0]
     if not Path(name).is_dir():
-        return Subject(name, experiment.find_source(name), None)
+        return Subject(name, experiments.find_source(name), None)
     # Options that say how to read the run, whose experiment says which other options there are.
     early: Callable[..., Any] = argparse.ArgumentParser
     parser = early(add_help=False, allow_abbrev=False, exit_on_error=False)
@@ -94,4 +115,7 @@ def chosen(
     Raises:
       UserError: there is no such option, or a value is wrong.
     """
-    return from_command_line(subject.source, words, prog, base=base, names=names)
+    experiment, options = from_command_line(subject.source, words, prog, base=base, names=names)
+    if subject.run is None and getattr(options, "checkpoint", "latest") != "latest":
+        raise UserError(f"{subject.name} is an experiment: --checkpoint is for a run's folder.")
+    return experiment, options

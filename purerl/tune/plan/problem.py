@@ -10,33 +10,25 @@ from typing import Any, NamedTuple
 from purerl.core.errors import UserError
 from purerl.runs.build_experiment import Setup, build
 from purerl.runs.experiment import Experiment
-from purerl.runs.options import check_seed
 from purerl.tune import subject
 from purerl.tune.overrides import environment_words
-from purerl.tune.plan.settings import Settings
-from purerl.tune.subject import Subject
+from purerl.tune.subject import PlanOptions, Subject
 
 AGAINST = "--against"
 BOTH = ("first", "second")  # the settings before it, and after it
 
 
 @dataclass(frozen=True)
-class Options(Settings):
+class Options(PlanOptions):
     """What is planned, and what becomes of it."""
 
     episodes: int = 1
     """Episodes, planned side by side; intervals need 5, those of --against too."""
     steps: int = 0
     """Control steps of an episode at most; 0: the experiment's time limit."""
-    seed: int = 0
-    """Seed of the episodes and the plans: episodes begin as those of `evaluate`."""
     no_policy: bool = False
     """Of a run: plan as if nothing were learned. By default, plans correct its policy's actions,
     and what its value says of a plan's last state counts."""
-    checkpoint: str = "latest"
-    """Of a run: latest, best (highest evaluation return), or an update's number."""
-    trust: bool = False
-    """Execute the run's experiment.py though this machine does not know it: read it first."""
     csv: Path | None = None
     """Write a row for each episode to this file."""
     json: Path | None = None
@@ -47,7 +39,6 @@ class Options(Settings):
     def __post_init__(self) -> None:
         """Checks the rules."""
         super().__post_init__()
-        check_seed(self.seed)
         for name, least in (("episodes", 1), ("steps", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}.")
@@ -102,11 +93,8 @@ def read(words: Sequence[str], prog: str) -> tuple[Problem, Problem | None, Opti
     found = subject.find(words, prog)
     prog = f"{prog} {found.name}"
     chosen, options = subject.chosen(found, words[1:], prog, Options)
-    if found.run is None and (options.no_policy or options.checkpoint != Options.checkpoint):
-        raise UserError(
-            f"{found.name} is an experiment, which has no policy and no checkpoints: --no-policy "
-            "and --checkpoint are for a run's folder."
-        )
+    if found.run is None and options.no_policy:
+        raise UserError(f"{found.name} is an experiment: --no-policy is for a run's folder.")
     first = _problem(found, chosen, options)
     if after is None:
         return first, None, options

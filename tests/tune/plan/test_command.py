@@ -80,7 +80,11 @@ def test_rewards_of_two_settings_are_not_compared():
         (["cartpole_swingup", "--csv", "no/such.csv"], "must be a file in a folder that exists"),
         (["cartpole_swingup", "--csv", "tests"], "csv is tests, a folder; it must be a file."),
         (["cartpole_swingup", "--csv", "a", "--json", "a"], "csv and json are both a"),
-        (["cartpole_swingup", "--no-policy"], "cartpole_swingup is an experiment, which has no"),
+        (["cartpole_swingup", "--no-policy"], "is an experiment: --no-policy is for a run's"),
+        (
+            ["cartpole_swingup", "--checkpoint", "3"],
+            "is an experiment: --checkpoint is for a",
+        ),
         (["cartpole_swingup", "--against"], "Nothing stands after --against: give other settings"),
         (
             ["cartpole_swingup", "--against", "--env.substeps", "2"],
