@@ -198,7 +198,7 @@ class Window:
     def text(self) -> str:
         return self.browser.value("document.body.innerText").replace("\u200b", "")
 
-    def wait(self, so, seconds: float = 30.0) -> None:
+    def wait(self, so, seconds: float = 90.0) -> None:  # of a machine that has other work
         end = time.monotonic() + seconds
         while not so():
             assert time.monotonic() < end, self.text()
