@@ -66,7 +66,7 @@ def command(words: Sequence[str]) -> None:
         write_file(options.csv, figures.rows(whole).encode())
     if options.json is not None:
         about: dict[str, Any] = {"problem": first.name, "trained": first.trained}
-        about["environments"] = {one.title: dataclasses.asdict(one.env) for one in problems}
+        about["environments"] = {one.title: one.settings for one in problems}
         about |= {"engine": first.setup.engine} | dataclasses.asdict(options)
         write_file(options.json, figures.as_json(whole, about).encode())
 

@@ -16,7 +16,7 @@ from purerl.tune.plan.filming import film, keep_observation, keep_picture
 
 FRAME = (640, 480)  # of a video [pixels]
 SAY = 10.0  # between two lines about how it goes [s]
-WAIT = 0.02  # between two looks for a signal [s]
+WAIT = 0.002  # between two looks for a signal [s]
 
 
 class Played(NamedTuple):
@@ -54,7 +54,7 @@ def play(problem: Any, options: Any, judges: dict[str, Any], stop: Callable[[], 
     begin = spoke = time.perf_counter()
     with told(""), blame(env):
         for now, computed in episodes.episodes(*game, judges, keep):
-            wait(computed, stop)
+            wait(computed)
             rows.append(jax.device_get(computed))
             clock = time.perf_counter()
             if len(rows) == 1:
@@ -74,14 +74,13 @@ def play(problem: Any, options: Any, judges: dict[str, Any], stop: Callable[[], 
     return Played(episodes.results(now), figures.judged(rows), starts)
 
 
-def wait(arrays: Any, stop: Callable[[], bool]) -> None:
-    """Waits for arrays that are being computed; a second signal then ends the process at once.
+def wait(arrays: Any) -> None:
+    """Waits for arrays that are being computed; a signal is heard meanwhile.
 
-    While Python waits inside JAX, no signal reaches it.
+    While Python waits inside JAX, no signal's handler runs, and a second signal could end nothing.
     """
     while not all(x.is_ready() for x in jax.tree.leaves(arrays)):
         time.sleep(WAIT)
-        stop()
 
 
 def progress(title: str, playing: Any, limit: int, seconds: float, calls: int) -> str:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from purerl.core.errors import UserError
 from purerl.runs.build_experiment import Setup, build
-from purerl.runs.experiment import Experiment
+from purerl.runs.experiment import Experiment, to_json
 from purerl.tune import subject
 from purerl.tune.overrides import environment_words
 from purerl.tune.subject import PlanOptions, Subject
@@ -69,7 +69,7 @@ class Problem(NamedTuple):
     name: str
     title: str  # of its column
     words: str  # the settings of the environment that are not those of the experiment's file
-    env: Any  # these settings
+    settings: dict[str, Any]  # all of them, as config.json has a run's
     setup: Setup
     learned: Any  # a run's TrainState; None: nothing
     trained: str  # what of a run that is, in words
@@ -118,7 +118,7 @@ def _problem(found: Subject, chosen: Experiment, options: Options) -> Problem:
         name=found.name,
         title=options.planner if run is None else f"{options.planner} + policy",
         words=" ".join(environment_words(written.experiment, chosen.env)),
-        env=chosen.env,
+        settings=to_json(chosen)["env"],
         setup=build(chosen),
         learned=None if run is None else run.state,
         trained="" if run is None else f"update {run.update:,} ({run.steps:,} steps)",
