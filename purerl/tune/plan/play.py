@@ -87,8 +87,8 @@ def progress(title: str, playing: Any, limit: int, seconds: float, calls: int) -
     """Returns a line about episodes that are being played."""
     done = playing.progress
     number, steps = len(done.over), min(int(done.t), limit)
-    rate = (calls - 1) * episodes.CHUNK * number / max(seconds, 1e-9)
-    return (
-        f"{title}: step {steps:,} of {limit:,}, return so far "
-        f"{float(done.episode.episode_return.mean()):.4g}, {rate:.1f} steps planned/s"
-    )
+    so_far = float(done.episode.episode_return.mean())
+    said = f"{title}: step {steps:,} of {limit:,}, return so far {so_far:.4g}"
+    if calls == 1:
+        return said
+    return f"{said}, {(calls - 1) * episodes.CHUNK * number / seconds:.1f} steps planned/s"

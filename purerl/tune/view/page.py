@@ -82,6 +82,8 @@ class Page:
         speed.on_update(lambda _: put(events.Speed(float(speed.value))))
         follow = gui.add_checkbox("Camera follows", True)
         follow.on_update(lambda _: setattr(self.scene, "follows", follow.value))
+        shadows = gui.add_checkbox("Shadows", True, hint="Without: faster where there is no GPU")
+        shadows.on_update(lambda _: self.scene.cast_shadows(shadows.value))
         seed = gui.add_number("Seed", session.seed, min=0, max=2**32 - 1, step=1)
         seed.on_update(lambda _: put(events.Seed(int(seed.value))))
         if checkpoints:

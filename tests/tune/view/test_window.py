@@ -185,6 +185,12 @@ def opened(trained: Path):
         process.wait(30)
 
 
+def _below(label: str, floors: range) -> str:
+    """Finds the element e that stands so many floors below an element that begins with a label."""
+    said = f".textContent.replace(/\\u200b/g, '').startsWith({json.dumps(label)})"
+    return " || ".join(f"e{'.parentElement' * n}{said}" for n in floors)
+
+
 class Window:
     """The page as a person sees and moves it."""
 
@@ -216,6 +222,10 @@ class Window:
         self._mark(f"e.textContent == {json.dumps(words)}", "button")
         self.browser.click("#marked")
 
+    def tick(self, label: str) -> None:
+        self._mark(_below(label, range(1, 9)), "input[type=checkbox]")
+        self.browser.click("#marked")
+
     def choose(self, label: str, option: str) -> None:
         self._mark(f"e.value == {json.dumps(label)}", "input")
         self.browser.click("#marked")
@@ -225,10 +235,7 @@ class Window:
 
     def press(self, slider: str, key: str) -> None:
         """Presses a key on a slider: End is its greatest value."""
-        above = [f"e{'.parentElement' * n}" for n in range(5, 9)]
-        said = f".textContent.replace(/\\u200b/g, '').startsWith({json.dumps(slider)})"
-        find = " || ".join(each + said for each in above)
-        self._mark(find, "[role=slider]")
+        self._mark(_below(slider, range(5, 9)), "[role=slider]")
         self.browser.value("document.querySelector('#marked').focus()")
         for kind in ("keyDown", "keyUp"):
             self.browser.ask("Input.dispatchKeyEvent", type=kind, key=key, code=key)
@@ -276,6 +283,10 @@ def play(window: Window, tmp_path: Path) -> None:
     # Another checkpoint.
     window.choose("latest", "1")
     window.wait(lambda: "of update 1 (32 steps)" in window.text())
+    # Without shadows the ground below the box is lighter.
+    shaded = window.drawn(tmp_path / "shaded.png")
+    window.tick("Shadows")
+    window.wait(lambda: window.drawn(tmp_path / "plain.png").sum() > shaded.sum())
     # The mouse holds the box and draws it up.
     still = window.drawn(tmp_path / "still.png")
     window.click("Play")
