@@ -92,10 +92,13 @@ def advance(
 
 
 def judge_step(judge: Env, state: State, action: Array) -> dict[str, Array]:
-    """Returns the reward, as "return", and its terms that a judge gives for one step, [E] each."""
+    """Returns what a judge says of one step, [E] each.
+
+    The reward, as "return", its terms, and whether the judge's episode ends with it, as "over".
+    """
     found = jax.vmap(judge.step)(state, action)
     terms = {name: x for name, x in found.metrics.items() if name.startswith(TERM)}
-    return {"return": found.reward} | terms
+    return {"return": found.reward, "over": found.terminated | found.truncated} | terms
 
 
 def episodes(

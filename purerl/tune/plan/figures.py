@@ -3,7 +3,7 @@
 import csv
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -88,14 +88,22 @@ def as_json(groups: Mapping[str, Figures], about: Mapping[str, Any]) -> str:
 def judged(rows: Sequence[Mapping[str, Any]]) -> Figures:
     """Returns what each judge says of the episodes, of the rows of `episodes.advance`.
 
-    The return is a sum over an episode, its terms are means over the steps, as metrics are.
+    A judge's episode may end before the one that was played: by its settings, nothing comes after.
+    The return is a sum over its episode, terms of the reward are means over its steps.
     """
-    steps = np.maximum(total(row["running"] for row in rows), 1.0)
-    found = {}
-    for judge, parts in rows[0]["judged"].items():
-        for part in parts:
-            whole = total(np.where(row["running"], row["judged"][judge][part], 0.0) for row in rows)
-            found[f"{part} under {judge}"] = whole if part == "return" else whole / steps
+    running, found = np.concatenate([row["running"] for row in rows]), {}
+    for judge in rows[0]["judged"]:
+        told = {k: np.concatenate([row["judged"][judge][k] for row in rows])
+                for k in rows[0]["judged"][judge]}  # fmt: skip
+        over = told.pop("over")
+        counts = running & (np.cumsum(over, axis=0) - over == 0)
+        length = counts.sum(axis=0)
+        for part, values in told.items():
+            whole = np.where(counts, values, 0.0).sum(axis=0, dtype=float)
+            found[f"{part} under {judge}"] = (
+                whole if part == "return" else whole / np.maximum(length, 1)
+            )
+        found[f"steps under {judge}"] = length.astype(float)
     return found
 
 
@@ -107,8 +115,3 @@ def compared(own: Figures, judged: Figures) -> Figures:
     """
     shared = {n: x for n, x in own.items() if n != RETURN and not n.startswith(TERM)}
     return shared | judged if judged else own
-
-
-def total(parts: Iterable[np.ndarray]) -> np.ndarray:
-    """Sums arrays [T, E] over time and parts, [E]."""
-    return np.sum([part.sum(axis=0, dtype=float) for part in parts], axis=0)

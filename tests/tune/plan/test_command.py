@@ -54,13 +54,23 @@ def test_notes_tell_of_few_lost_and_one_step_episodes():
     assert short == "a: every episode ended with its first step."
 
 
-def test_a_judge_counts_what_belongs_to_the_episode():
+def test_a_judge_counts_what_belongs_to_the_episode_and_to_its_own():
     running = np.array([[True, True], [True, False]])
-    parts = {"return": np.array([[1.0, 2.0], [3.0, np.nan]]), "reward_run": np.full((2, 2), 3.0)}
-    row = {"running": running, "judged": {"b": parts}}
-    found = figures.judged([row, row])
+    parts = {
+        "return": np.array([[1.0, 2.0], [3.0, np.nan]]),
+        "reward_run": np.full((2, 2), 3.0),
+        "over": np.zeros((2, 2), bool),
+    }
+    rows = [{"running": running, "judged": {"b": parts}}] * 2
+    found = figures.judged(rows)
     assert found["return under b"].tolist() == [8.0, 4.0]
     assert found["reward_run under b"].tolist() == [3.0, 3.0]  # a mean over its steps
+    assert found["steps under b"].tolist() == [4.0, 2.0]
+    # Its own end, in the first episode's second step: that step counts, no later one does.
+    ended = {"b": parts | {"over": np.array([[False, False], [True, False]])}}
+    found = figures.judged([{"running": running, "judged": ended}, rows[1]])
+    assert found["return under b"].tolist() == [4.0, 4.0]
+    assert found["steps under b"].tolist() == [2.0, 2.0]
 
 
 def test_rewards_of_two_settings_are_not_compared():
