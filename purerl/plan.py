@@ -32,7 +32,7 @@ def command(words: Sequence[str]) -> None:
     """Plans, prints the figures, and writes the files that were asked for."""
     from purerl.devices.compilation import set_up_jax
     from purerl.report.opengl import choose_gl
-    from purerl.runs.files import write_file
+    from purerl.runs.files import write_answer
     from purerl.runs.training import set_xla_flags_in_time, stop_signals
     from purerl.tune.plan import figures
     from purerl.tune.plan.play import play
@@ -63,12 +63,12 @@ def command(words: Sequence[str]) -> None:
     output.show(*titles(problems), *said)
     whole = {name: x.figures | x.judged for name, x in played.items()}
     if options.csv is not None:
-        write_file(options.csv, figures.rows(whole).encode())
+        write_answer(options.csv, figures.rows(whole).encode())
     if options.json is not None:
         about: dict[str, Any] = {"problem": first.name, "trained": first.trained}
         about["environments"] = {one.title: one.settings for one in problems}
         about |= {"engine": first.setup.engine} | dataclasses.asdict(options)
-        write_file(options.json, figures.as_json(whole, about).encode())
+        write_answer(options.json, figures.as_json(whole, about).encode())
 
 
 def titles(problems: Sequence[Any]) -> list[str]:

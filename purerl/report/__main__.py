@@ -39,7 +39,7 @@ def command(options: Options) -> None:
     """Writes the page, and prints where it is."""
     from purerl.report.page import make_page
     from purerl.report.run_reader import find_runs, read
-    from purerl.runs.files import write_file
+    from purerl.runs.files import write_answer
 
     if not options.runs:
         raise UserError("Give the runs to report: python -m purerl.report RUN RUN ...")
@@ -47,7 +47,7 @@ def command(options: Options) -> None:
         raise UserError(f"{options.out} is a folder: give a file, as --out {options.out}/a.html.")
     runs = [read(path) for path in find_runs(options.runs)]
     page = make_page(runs, options.group_by).encode()
-    write_file(options.out, page)
+    write_answer(options.out, page)
     number = f"{len(runs)} run{'s' * (len(runs) > 1)}"
     show(f"{options.out} ({number}, {len(page):,} bytes): open it in a browser")
 

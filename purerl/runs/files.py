@@ -147,6 +147,21 @@ def write_file(path: Path, content: bytes) -> None:
         raise UserError(f"{path} cannot be written: {error.strerror}.") from error
 
 
+def write_answer(path: Path, content: bytes) -> None:
+    """Writes a file that a person has named: whole or not at all, as `write_file`.
+
+    A device, a pipe or a link, such as /dev/stdout, is written into: a file in its place would be
+    the end of it.
+    """
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        try:
+            path.write_bytes(content)
+        except OSError as error:
+            raise UserError(f"{path} cannot be written: {error.strerror}.") from error
+    else:
+        write_file(path, content)
+
+
 def make_folder(path: Path) -> None:
     """Makes a folder, and those above it that are missing."""
     missing = [place for place in (path, *path.parents) if not place.exists()]

@@ -7,6 +7,7 @@ import pty
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from purerl import run
 from purerl.core.errors import FAILURE, SUCCESS, USAGE, RunError, UserError
 from purerl.report import opengl
 from purerl.runs import command_errors, output
+from purerl.runs.files import write_answer
 from tests.runs.test_run import ROOT, TOY, digest, folder, whole  # noqa: F401
 
 pytestmark = pytest.mark.slow
@@ -170,3 +172,24 @@ def test_an_environment_that_cannot_be_drawn_is_told_by_its_public_name(tmp_path
     with pytest.raises(UserError, match=r"no `physics` of the type purerl\.Physics\.$"):
         video.make_video(purerl.load(folder(tmp_path)), "", 1, 1.0, (32, 32), 0)
     assert isinstance(purerl.Physics, type)
+
+
+def test_a_link_a_pipe_and_a_device_are_written_into_and_not_replaced(tmp_path):
+    target, link, pipe = (tmp_path / name for name in ("target", "link", "pipe"))
+    link.symlink_to(target)
+    target.write_bytes(b"what was there before, and is longer")
+    write_answer(link, b"told")
+    assert link.is_symlink() and target.read_bytes() == b"told"
+    os.mkfifo(pipe)
+    with ThreadPoolExecutor(1) as pool:
+        read = pool.submit(pipe.read_bytes)
+        write_answer(pipe, b"told")
+        assert read.result(10) == b"told" and pipe.is_fifo()
+    full = tmp_path / "full"
+    full.symlink_to("/dev/full")
+    with pytest.raises(UserError, match="full cannot be written: No space left on device."):
+        write_answer(full, b"told")
+    assert full.is_symlink()
+    plain = tmp_path / "plain"
+    write_answer(plain, b"told")
+    assert plain.read_bytes() == b"told" and len(list(tmp_path.iterdir())) == 5  # and no draft
