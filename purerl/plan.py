@@ -23,9 +23,9 @@ PROG = "python -m purerl.plan"
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     from purerl.tune.plan.problem import Options
-    from purerl.tune.subject import carry_out
+    from purerl.tune.subject import carry_out_on_subject
 
-    return carry_out(command, Options, __doc__, PROG, arguments)
+    return carry_out_on_subject(command, Options, __doc__, PROG, arguments)
 
 
 def command(words: Sequence[str]) -> None:

@@ -16,7 +16,7 @@ from typing import Literal
 from purerl.core.errors import UserError
 from purerl.runs.command_errors import leave
 from purerl.runs.output import show
-from purerl.tune.subject import PlanOptions, carry_out, chosen as settings_of, find
+from purerl.tune.subject import PlanOptions, carry_out_on_subject, chosen as settings_of, find
 
 PROG = "python -m purerl.view"
 
@@ -37,7 +37,7 @@ class Options(PlanOptions):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return carry_out(command, Options, __doc__, PROG, arguments)
+    return carry_out_on_subject(command, Options, __doc__, PROG, arguments)
 
 
 def has_viser() -> bool:

@@ -15,6 +15,7 @@ table of means with 95% intervals is printed at the end, and by --table alone.
 import argparse
 import csv
 import dataclasses
+import functools
 import itertools
 import time
 from pathlib import Path
@@ -74,11 +75,7 @@ def play(task: str, name: str, steps: int, seed: int, number: int) -> list[dict]
     limit = steps or config.episode_length
     config = dataclasses.replace(config, episode_length=limit)
 
-    def guide(learned: Any) -> planner.Guide:
-        if learned is None:
-            return planner.unguided(env.action_size)
-        return planner.guide(config, network, learned)
-
+    guide = functools.partial(planner.guide_of, config, env, network)
     learned = run.state if run and name.endswith("policy") else None
     game = episodes.episodes(config, settings_of(task, name), env, guide, learned, seed, number)
     times = []

@@ -6,8 +6,9 @@
 
 Predictive sampling with a linear spline of 8 knots, 64 plans of 50 physics steps before each
 action, and a reward that costs nothing to compute. Each is run where it is installed: judo asks for
-another MuJoCo than this project. judo and hydrax take dm_control's cart-pole without its energy
-flag, which MJX lacks. The figure is the median of 100 plans.
+another MuJoCo than this project. The cart-pole that was measured is dm_control's
+(dm_control/suite/cartpole.xml) without its energy flag, which MJX lacks. The figure is the median
+of 100 plans.
 """
 
 import argparse

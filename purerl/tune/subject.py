@@ -45,7 +45,7 @@ class Subject(NamedTuple):
     run: Run | None  # if it is one
 
 
-def carry_out(
+def carry_out_on_subject(
     command: Callable[[Sequence[str]], None],
     base: Any,
     about: str | None,

@@ -86,6 +86,13 @@ def unguided(action_size: int) -> Guide:
     return Guide(act, (), 1.0)
 
 
+def guide_of(config: Config, env: Env, network: Network, learned: TrainState | None) -> Guide:
+    """Returns the guide of what was learned; of nothing, None, `unguided`."""
+    if learned is None:
+        return unguided(env.action_size)
+    return guide(config, network, learned)
+
+
 def start(settings: Settings, env: Env, guide: Guide) -> Plan:
     """Returns the plan at the start of an episode: to do nothing, or what the guide does."""
     knots = jnp.zeros((settings.knots, env.action_size))

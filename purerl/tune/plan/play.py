@@ -1,6 +1,7 @@
 """Episodes that the command plans: telling how it goes, stopping when asked to."""
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -43,11 +44,7 @@ def play(problem: Any, options: Any, judges: dict[str, Any], stop: Callable[[], 
     limit = options.steps or config.episode_length
     config = dataclasses.replace(config, episode_length=limit)
 
-    def guide(learned: Any) -> planner.Guide:
-        if learned is None:
-            return planner.unguided(env.action_size)
-        return planner.guide(config, network, learned)
-
+    guide = functools.partial(planner.guide_of, config, env, network)
     keep = keep_picture(env) if options.video else keep_observation
     game = (config, options, env, guide, problem.learned, options.seed, options.episodes)
     rows: list[Any] = []

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from purerl.tune.plan.episodes import TERM
 from purerl.tune.view.session import Row, Session
 
-PREFIX = "reward_"  # a metric so named is a term of the reward
 MOST_POINTS = 200  # of a plot's line
 RECENT = 1.0  # what "per second" is taken over [s]
 
@@ -22,13 +22,13 @@ class Plot(NamedTuple):
 def terms_of(session: Session) -> tuple[str, ...]:
     """Returns the metrics that are terms of the reward."""
     names = session.rows[-1].metrics if session.rows else session.sums
-    return tuple(name for name in names if name.startswith(PREFIX))
+    return tuple(name for name in names if name.startswith(TERM))
 
 
 def reward_plot(session: Session) -> Plot:
     """Returns the reward and its terms, per control step."""
     terms = terms_of(session)
-    names = ("reward", *(term.removeprefix(PREFIX) for term in terms))
+    names = ("reward", *(term.removeprefix(TERM) for term in terms))
     return _plot(session, names, lambda row: [row.reward, *(row.metrics[t] for t in terms)])
 
 
@@ -61,7 +61,7 @@ def reward_table(session: Session) -> str:
     for term in terms:
         mean = _mean(recent, term)
         share = f"{mean / whole:+.0%}" if whole > 0 else ""
-        name = html.escape(term.removeprefix(PREFIX))
+        name = html.escape(term.removeprefix(TERM))
         lines.append(_line(name, last.metrics[term], mean, session.sums[term], share))
     for name in others:
         mean = _mean(recent, name)
