@@ -20,7 +20,7 @@ from purerl.ppo.batches import Batch, make_batch
 from purerl.ppo.config import Config
 from purerl.ppo.learner import learn
 from purerl.ppo.optimizer import optimizer
-from purerl.ppo.rollout import Transition, rollout, start_episodes
+from purerl.ppo.rollout import Transition, rollout, start_episodes, time_limits
 from purerl.ppo.running_moments import Moments
 
 
@@ -38,14 +38,17 @@ class Experience(NamedTuple):
 def init(config: Config, env: Env, network: Network, key: Array) -> TrainState:
     """Returns the state before the first update, all of it drawn from `key` [].
 
-    Time limits of the first episodes are uniform in [1, episode_length], so that environments do
-    not stay in phase: B environments all at the same moment of an episode are one sample.
+    Time limits of the first episodes are uniform in 1 to what the environment's others have, so
+    that environments do not stay in phase: B environments all at the same moment of an episode are
+    one sample.
     """
     params, carry = network.init(derive(key, Purpose.PARAMETERS))
     size, number = config.num_envs, jnp.arange(config.num_envs, dtype=jnp.int32)
     env_state = jax.vmap(env.reset)(per_environment(derive(key, Purpose.FIRST_RESET), number))
     limit_keys = per_environment(derive(key, Purpose.FIRST_LIMIT), number)
-    limit = jax.vmap(lambda k: jax.random.randint(k, (), 1, config.episode_length + 1))(limit_keys)
+    limit = jax.vmap(lambda k, longest: jax.random.randint(k, (), 1, longest + 1))(
+        limit_keys, time_limits(config, number)
+    )
     return TrainState(
         params=params,
         optimizer=optimizer(config).init(params),

@@ -16,6 +16,7 @@ TRAINING = (
     ("above 0, and finite", lambda x: 0.0 < x < math.inf, "learning_rate desired_kl reward_scale"),
     ("above 0, and finite", lambda x: 0.0 < x < math.inf, "clip max_gradient_norm"),
     ("0 or above", lambda x: 0.0 <= x < math.inf, "value_weight entropy_weight segment_length"),
+    ("0 or above", lambda x: 0.0 <= x < math.inf, "shortest_episode advantage_clip"),
 )
 EVALUATION = (
     (*SIZE, "num_episodes"),
@@ -29,6 +30,15 @@ def check_rules(settings: Any, rules: tuple) -> None:
         for name in names.split():
             if not holds(getattr(settings, name)):
                 raise ValueError(f"{name} is {getattr(settings, name)}; it must be {rule}.")
+
+
+def check_limits(config: Any) -> None:
+    """Checks that no training episode is longer than an episode."""
+    if config.shortest_episode > config.episode_length:
+        raise ValueError(
+            f"shortest_episode is {config.shortest_episode}; it must be at most episode_length, "
+            f"which is {config.episode_length}."
+        )
 
 
 def check_budget(config: Any) -> None:

@@ -22,6 +22,10 @@ class Config:
     """Gradient steps in one pass."""
     episode_length: int = 1000
     """Time limit of an episode [control steps]; reaching it truncates."""
+    shortest_episode: int = 0
+    """Time limit of the first environment's training episodes [control steps]. Those of the others
+    rise to `episode_length`, evenly in their logarithm: starts are practised more often, and long
+    episodes are not forgotten. 0: all are `episode_length`."""
     gamma: float = 0.99
     """Discount of one control step."""
     gae_lambda: float = 0.95
@@ -32,6 +36,8 @@ class Config:
     values of that moment. 0: once an update, over whole rollouts."""
     clip: float = 0.2
     """Range of the policy ratio, 1 +- clip."""
+    advantage_clip: float = 0.0
+    """Range of the normalized advantage, +- so many standard deviations; 0: any."""
     value_weight: float = 0.5
     """Weight of the value loss."""
     entropy_weight: float = 0.0
@@ -52,6 +58,7 @@ class Config:
     def __post_init__(self) -> None:
         """Raises ValueError for a number outside its range or a budget below one update."""
         checks.check_rules(self, checks.TRAINING)
+        checks.check_limits(self)
         checks.check_budget(self)
 
     @property

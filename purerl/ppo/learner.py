@@ -159,7 +159,7 @@ def loss(
     output = unroll(network, params, batch, memory)
     log_prob = distributions.log_prob(output.distribution, batch.raw_action)
     log_ratio = log_prob - batch.log_prob
-    advantage = losses.normalize_advantage(batch.advantage, scale)
+    advantage = losses.normalize_advantage(batch.advantage, scale, config.advantage_clip)
     terms = {
         "policy_loss": losses.clipped_surrogate(log_ratio, advantage, config.clip),
         "value_loss": losses.value_loss(output.value, batch.target),

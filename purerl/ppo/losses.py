@@ -10,12 +10,15 @@ from purerl.core.records import Array
 from purerl.ppo.running_moments import Moments, moments, pool
 
 
-def normalize_advantage(advantage: Array, scale: Moments) -> Array:
+def normalize_advantage(advantage: Array, scale: Moments, clip: float = 0.0) -> Array:
     """Returns the advantage with mean 0 and standard deviation 1, by a minibatch's moments [].
 
-    The same shape.
+    The same shape; clipped to +- `clip` unless that is 0. Where a policy has learned its task,
+    advantages are small errors of the value, and one failure among M samples is sqrt(M) deviations
+    away: the ratio's clip does not hold a negative one, and it moves the policy alone.
     """
-    return (advantage - scale.mean) / (jnp.sqrt(scale.variance) + 1e-8)
+    normalized = (advantage - scale.mean) / (jnp.sqrt(scale.variance) + 1e-8)
+    return jnp.clip(normalized, -clip, clip) if clip else normalized
 
 
 def clipped_surrogate(log_ratio: Array, advantage: Array, clip: float) -> Array:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from purerl.core.env import ABSURD, Env, State
 from purerl.core.keys import Purpose, derive, per_environment
@@ -84,6 +85,19 @@ def episode_metrics(episode: EpisodeStats) -> Metrics:
 def start_memory(carry: PyTree, number: int) -> PyTree:
     """Returns the memory of `number` episodes about to start, like a `carry` [B, ...]: zeros."""
     return jax.tree.map(lambda x: jnp.zeros((number, *x.shape[1:]), x.dtype), carry)
+
+
+def time_limits(config: Config, number: Array) -> Array:
+    """Returns the time limits of training episodes, [B] int32, of environments `number` [B].
+
+    Where most of an episode is spent at the goal, as in reaching, its start is a small part of what
+    is seen. Shorter episodes begin more often; but a policy that never saw a long one may drift out
+    of what it knows. So every environment keeps a limit of its own, from short to whole.
+    """
+    if not config.shortest_episode:
+        return jnp.full(number.shape, config.episode_length, jnp.int32)
+    spaced = np.geomspace(config.shortest_episode, config.episode_length, config.num_envs)
+    return jnp.asarray(np.round(spaced), jnp.int32)[number]
 
 
 def start_episodes(state: State, limit: Array) -> EpisodeStats:
@@ -212,7 +226,7 @@ def _step(
         truncation_value=truncation_values(network, state, env_state, memory, truncated),
         valid=~lost,
     )
-    limit = jnp.full(over.shape, config.episode_length, jnp.int32)
+    limit = time_limits(config, state.number)
     following = Carry(
         env=select(over, fresh, env_state),
         memory=jax.tree.map(lambda x: select(over, jnp.zeros_like(x), x), memory),

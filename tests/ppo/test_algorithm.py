@@ -14,7 +14,7 @@ from purerl.core.env import State
 from purerl.core.parts import WHOLE, as_one_part
 from purerl.core.records import count_as_int
 from purerl.ppo import algorithm, batches, evaluation, learner, networks, optimizer, running_moments
-from purerl.ppo.rollout import rollout
+from purerl.ppo.rollout import rollout, time_limits
 from tests import quick
 from tests.ppo.test_running_moments import update as merge_batch
 
@@ -123,6 +123,21 @@ def test_time_limits_truncate_and_the_first_are_staggered():
     assert not transitions.terminated.any()
     np.testing.assert_array_equal(transitions.truncated, done)
     np.testing.assert_array_equal(finished["episodes"], done.sum(0))
+
+
+def test_training_episodes_have_limits_from_the_shortest_to_whole_ones_each_environment_its_own():
+    config = dataclasses.replace(CONFIG, shortest_episode=2)
+    env, network, _ = setup()
+    state = algorithm.init(config, env, network, jax.random.key(4))
+    own = [2, 3, 3, 4, 5, 7]  # 2 * (7 / 2) ** (i / 5), to the nearest
+    assert (np.asarray(state.episode.limit) <= own).all()
+    _, transitions, _, _ = ROLLOUT(config, env, network, state)
+    for b in range(6):
+        ends = np.flatnonzero(np.asarray(transitions.truncated)[:, b]) + 1
+        assert ends[0] == state.episode.limit[b]
+        assert (np.diff(ends) == own[b]).all()
+    part = state.replace(number=jnp.array([4, 1]))  # of a shard: numbers of the whole
+    np.testing.assert_array_equal(time_limits(config, part.number), [5, 3])
 
 
 def test_every_environment_and_update_has_a_fresh_start():
@@ -338,6 +353,22 @@ def test_a_lost_sample_has_no_weight_in_the_update():
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.parametrize("clip", [0.0, 1.5])
+def test_advantages_are_clipped_after_they_are_normalized(clip):
+    """The first ratio is 1: the loss of one minibatch is minus the mean of what it was given."""
+    env, network, state = setup()
+    _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
+    batch = batches.make_batch(CONFIG, state, transitions, last_value, state.episode.length == 0)
+    advantage = jnp.linspace(-1.0, 1.0, 96).reshape(16, 6).at[5, 2].set(-30.0)  # one failure
+    config = dataclasses.replace(CONFIG, num_epochs=1, num_minibatches=1, advantage_clip=clip)
+    batch = batch._replace(advantage=advantage)
+    metrics = learn(config, network, state, batch, ())[1]
+    given = (advantage - advantage.mean()) / advantage.std()
+    if clip:
+        given = np.clip(given, -clip, clip)
+    np.testing.assert_allclose(metrics["policy_loss"], -given.mean(), atol=1e-6)
+
+
 def altered(network, change):
     """The network with other parameters or another memory, which its `apply` undoes."""
 
@@ -483,6 +514,7 @@ def test_update_keeps_rank_promotion_strict():
         ({"segment_length": -4}, ("segment_length is -4", "0 or above")),
         ({"num_steps": 2**53 + 1}, ("num_steps is 9007199254740993", "at most 2**53")),
         ({"num_steps": 96 * 2**31}, ("2**31 updates or more", "= 96", "lower num_steps")),
+        ({"shortest_episode": 8}, ("shortest_episode is 8", "at most episode_length, which is 7")),
         ({"num_envs": 2**16, "rollout_length": 2**15}, (f"= {2**31} must be below 2**31;",)),
         ({"num_envs": 2**31 - 1}, (f"num_envs is {2**31 - 1}", "below 2**31 - 1")),
         ({"num_epochs": 2**31}, ("num_epochs", "below 2**31 - 1")),

@@ -61,6 +61,15 @@ def test_advantage_normalized_over_all_axes():
     np.testing.assert_allclose(normalized.std(), 1.0, rtol=1e-5)
 
 
+def test_one_failure_among_alike_samples_is_clipped_and_the_others_are_not():
+    advantage = jnp.zeros(100).at[3].set(-1.0)
+    scale = moments(advantage, jnp.ones(100, bool))
+    whole = losses.normalize_advantage(advantage, scale)
+    clipped = losses.normalize_advantage(advantage, scale, 4.0)
+    np.testing.assert_allclose(whole[3], -np.sqrt(99.0), rtol=1e-5)
+    np.testing.assert_array_equal(clipped, whole.at[3].set(-4.0))
+
+
 def test_kl_estimate_is_unbiased_and_never_negative():
     """Two Gaussians of scale 1 whose means differ by 0.3: KL = 0.3^2 / 2."""
     x = jax.random.normal(jax.random.key(0), (200_000,))
