@@ -2,7 +2,7 @@
 
 python -m purerl.run suite --env.task cheetah-run --name cheetah-run
 
-Expected: return 870 of 1000 after 4 min, on one CPU core; others: docs/measurements/suite.md.
+Expected: return 800 of 1000 after 2.5 min, on one CPU core; others: docs/measurements/suite.md.
 """
 
 from envs.suite import tasks

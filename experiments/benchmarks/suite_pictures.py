@@ -66,7 +66,12 @@ def _draw_task(panel: Any, seeds: Sequence[Seed], published: dict[str, float], a
         if column in published:
             panel.axhline(published[column], color=color, linewidth=1, linestyle="--", label=label)
     panel.set_ylim(0, BEST * 1.03)
+    panel.xaxis.set_major_formatter("{x:.3g}" if across == "seconds" else _in_millions)
     panel.grid(alpha=0.3)
+
+
+def _in_millions(steps: float, _: int) -> str:
+    return f"{steps / 1e6:g} M"
 
 
 def draw_together(path: Path, tasks: dict[str, list[Seed]]) -> None:

@@ -38,9 +38,8 @@ class Experience(NamedTuple):
 def init(config: Config, env: Env, network: Network, key: Array) -> TrainState:
     """Returns the state before the first update, all of it drawn from `key` [].
 
-    Time limits of the first episodes are uniform in 1 to what the environment's others have, so
-    that environments do not stay in phase: B environments all at the same moment of an episode are
-    one sample.
+    The first episodes' time limits are uniform in 1 to the environment's own, so that environments
+    do not stay in phase: B environments all at the same moment of an episode are one sample.
     """
     params, carry = network.init(derive(key, Purpose.PARAMETERS))
     size, number = config.num_envs, jnp.arange(config.num_envs, dtype=jnp.int32)

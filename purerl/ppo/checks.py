@@ -32,17 +32,12 @@ def check_rules(settings: Any, rules: tuple) -> None:
                 raise ValueError(f"{name} is {getattr(settings, name)}; it must be {rule}.")
 
 
-def check_limits(config: Any) -> None:
-    """Checks that no training episode is longer than an episode."""
-    if config.shortest_episode > config.episode_length:
-        raise ValueError(
-            f"shortest_episode is {config.shortest_episode}; it must be at most episode_length, "
-            f"which is {config.episode_length}."
-        )
-
-
 def check_budget(config: Any) -> None:
-    """Checks that the run has an update, and that int32 counts its samples and its updates."""
+    """Checks episodes, that there is an update, and that int32 counts samples and updates."""
+    if (shortest := config.shortest_episode) > (most := config.episode_length):
+        raise ValueError(
+            f"shortest_episode is {shortest}; it must be at most episode_length, which is {most}."
+        )
     size = f"num_envs * rollout_length = {config.steps_per_update}"
     if config.steps_per_update >= COUNTS:
         raise ValueError(f"{size} must be below 2**31; lower one of the two.")

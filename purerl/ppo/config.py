@@ -23,9 +23,8 @@ class Config:
     episode_length: int = 1000
     """Time limit of an episode [control steps]; reaching it truncates."""
     shortest_episode: int = 0
-    """Time limit of the first environment's training episodes [control steps]. Those of the others
-    rise to `episode_length`, evenly in their logarithm: starts are practised more often, and long
-    episodes are not forgotten. 0: all are `episode_length`."""
+    """Time limit of the first environment's training episodes [control steps]; the others' rise
+    to `episode_length`, evenly in their logarithm. 0: all are `episode_length`."""
     gamma: float = 0.99
     """Discount of one control step."""
     gae_lambda: float = 0.95
@@ -58,7 +57,6 @@ class Config:
     def __post_init__(self) -> None:
         """Raises ValueError for a number outside its range or a budget below one update."""
         checks.check_rules(self, checks.TRAINING)
-        checks.check_limits(self)
         checks.check_budget(self)
 
     @property

@@ -34,14 +34,9 @@ def evaluate(
 ) -> Metrics:
     """Runs N whole episodes, each in an environment of its own, until the last one ends.
 
-    Args:
-      config: for the time limit.
-      env: the environment.
-      network: the network.
-      state: for `params` and `normalizer`, and the shape of one environment's memory.
-      key: [] typed; must not be one that training uses.
-      num_episodes: N.
-      deterministic: act by the distribution's location instead of a sample.
+    Of `config` it reads the time limit; of `state` the parameters, the normalizer and the shape of
+    a memory. `key` [] must not be one that training uses. A deterministic policy acts by its
+    distribution's location, not by a sample.
 
     Returns:
       "episode_return", "episode_length" and every metric of the environment, name -> [N], and
@@ -86,13 +81,9 @@ def start(
 
 
 def advance(env: Env, progress: Progress, action: Array, memory: PyTree) -> Progress:
-    """Takes one control step in every episode that is not over.
+    """Takes one control step, `action` [N, A], in every episode that is not over.
 
-    Args:
-      env: the environment.
-      progress: the episodes, [N, ...].
-      action: [N, A].
-      memory: the policy's after it has chosen the action, [N, ...].
+    `memory` [N, ...] is the policy's after it has chosen the action.
     """
     env_state, episode = rollout.step_episodes(env, progress.env, progress.episode, action)
     lost = jax.vmap(rollout.is_lost)(env_state)

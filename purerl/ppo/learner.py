@@ -41,18 +41,10 @@ def learn(
     first: Array,
     parts: Parts,
 ) -> tuple[TrainState, Metrics]:
-    """Makes E epochs of K minibatch steps.
+    """Makes E epochs of K minibatch steps; does not read the environments in `state`.
 
-    Each part shuffles its own samples, and has an equal share of every minibatch.
-
-    Args:
-      config: the hyperparameters.
-      network: the network.
-      state: its environments are not read.
-      batch: [V, T, B, ...].
-      memory: [V, B, H], the policy's at the start of the rollout.
-      first: [V] number of each part's first environment, by which it shuffles.
-      parts: how the V parts are computed.
+    Each part shuffles its own samples of a rollout, [V, T, B, ...], by the number of its `first`
+    environment [V], and has an equal share of every minibatch. `memory` [V, B, H] opens it.
     """
     batch = jax.vmap(functools.partial(arrange, config, is_recurrent(memory)))(batch)
     columns = batch.weight.shape[-1]
@@ -188,14 +180,8 @@ def minibatch_step(
 ) -> tuple[Learner, Metrics]:
     """Makes one gradient step; a step with a number that is not finite is skipped and counted.
 
-    Args:
-      config: the hyperparameters.
-      network: the network.
-      learner: what the step changes.
-      batch: the minibatch, [V, T', M, ...].
-      memory: [V, M, H].
-      scale: of its advantages; None: segments, whose advantages are estimated anew.
-      parts: how the V parts are computed.
+    The minibatch is [V, T', M, ...], its memory [V, M, H]. `scale` is of its advantages; without
+    one, it consists of segments, whose advantages are estimated anew.
     """
     if scale is None:
         anew = functools.partial(renew, config, network, learner.params)

@@ -13,9 +13,8 @@ from purerl.ppo.running_moments import Moments, moments, pool
 def normalize_advantage(advantage: Array, scale: Moments, clip: float = 0.0) -> Array:
     """Returns the advantage with mean 0 and standard deviation 1, by a minibatch's moments [].
 
-    The same shape; clipped to +- `clip` unless that is 0. Where a policy has learned its task,
-    advantages are small errors of the value, and one failure among M samples is sqrt(M) deviations
-    away: the ratio's clip does not hold a negative one, and it moves the policy alone.
+    The same shape; clipped to +- `clip` unless that is 0. One failure among M samples that are
+    alike is sqrt(M) deviations away, and where it is negative the ratio's clip does not hold it.
     """
     normalized = (advantage - scale.mean) / (jnp.sqrt(scale.variance) + 1e-8)
     return jnp.clip(normalized, -clip, clip) if clip else normalized

@@ -90,9 +90,8 @@ def start_memory(carry: PyTree, number: int) -> PyTree:
 def time_limits(config: Config, number: Array) -> Array:
     """Returns the time limits of training episodes, [B] int32, of environments `number` [B].
 
-    Where most of an episode is spent at the goal, as in reaching, its start is a small part of what
-    is seen. Shorter episodes begin more often; but a policy that never saw a long one may drift out
-    of what it knows. So every environment keeps a limit of its own, from short to whole.
+    Short episodes practise the start; a policy that never saw a long one drifts out of what it
+    knows. So every environment keeps a limit of its own, from short to whole.
     """
     if not config.shortest_episode:
         return jnp.full(number.shape, config.episode_length, jnp.int32)
@@ -146,10 +145,7 @@ def truncation_values(
 def episode_sums(episode: EpisodeStats, over: Array, lost: Array) -> Metrics:
     """Returns what each environment [B] adds to the sums of a rollout in one step.
 
-    Args:
-      episode: its episode.
-      over: [B] bool: the episode ends.
-      lost: [B] bool: it ends because its state is not finite, or absurd.
+    Its episode may be `over` [B], `lost` [B] if because its state is not finite, or absurd.
     """
     metrics = {f"episode/{name}": x for name, x in episode_metrics(episode).items()}
     ended = {"episodes": jnp.ones(over.shape), "episode_return": episode.episode_return}
