@@ -33,11 +33,7 @@ def check_rules(settings: Any, rules: tuple) -> None:
 
 
 def check_budget(config: Any) -> None:
-    """Checks episodes, that there is an update, and that int32 counts samples and updates."""
-    if (shortest := config.shortest_episode) > (most := config.episode_length):
-        raise ValueError(
-            f"shortest_episode is {shortest}; it must be at most episode_length, which is {most}."
-        )
+    """Checks that the run has an update, and that int32 counts its samples and its updates."""
     size = f"num_envs * rollout_length = {config.steps_per_update}"
     if config.steps_per_update >= COUNTS:
         raise ValueError(f"{size} must be below 2**31; lower one of the two.")

@@ -24,7 +24,7 @@ class Config:
     """Time limit of an episode [control steps]; reaching it truncates."""
     shortest_episode: int = 0
     """Time limit of the first environment's training episodes [control steps]; the others' rise
-    to `episode_length`, evenly in their logarithm. 0: all are `episode_length`."""
+    to `episode_length`, evenly in their logarithm. 0, or not below that: all are that long."""
     gamma: float = 0.99
     """Discount of one control step."""
     gae_lambda: float = 0.95

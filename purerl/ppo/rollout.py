@@ -93,7 +93,7 @@ def time_limits(config: Config, number: Array) -> Array:
     Short episodes practise the start; a policy that never saw a long one drifts out of what it
     knows. So every environment keeps a limit of its own, from short to whole.
     """
-    if not config.shortest_episode:
+    if not 0 < config.shortest_episode < config.episode_length:
         return jnp.full(number.shape, config.episode_length, jnp.int32)
     spaced = np.geomspace(config.shortest_episode, config.episode_length, config.num_envs)
     return jnp.asarray(np.round(spaced), jnp.int32)[number]

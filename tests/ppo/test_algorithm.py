@@ -138,6 +138,9 @@ def test_training_episodes_have_limits_from_the_shortest_to_whole_ones_each_envi
         assert (np.diff(ends) == own[b]).all()
     part = state.replace(number=jnp.array([4, 1]))  # of a shard: numbers of the whole
     np.testing.assert_array_equal(time_limits(config, part.number), [5, 3])
+    for none in (0, LENGTH, LENGTH + 1):  # a planner, too, shortens episodes and asks no one
+        whole = dataclasses.replace(config, shortest_episode=none)
+        np.testing.assert_array_equal(time_limits(whole, part.number), [LENGTH, LENGTH])
 
 
 def test_every_environment_and_update_has_a_fresh_start():
@@ -514,7 +517,7 @@ def test_update_keeps_rank_promotion_strict():
         ({"segment_length": -4}, ("segment_length is -4", "0 or above")),
         ({"num_steps": 2**53 + 1}, ("num_steps is 9007199254740993", "at most 2**53")),
         ({"num_steps": 96 * 2**31}, ("2**31 updates or more", "= 96", "lower num_steps")),
-        ({"shortest_episode": 8}, ("shortest_episode is 8", "at most episode_length, which is 7")),
+        ({"shortest_episode": -1}, ("shortest_episode is -1", "0 or above")),
         ({"num_envs": 2**16, "rollout_length": 2**15}, (f"= {2**31} must be below 2**31;",)),
         ({"num_envs": 2**31 - 1}, (f"num_envs is {2**31 - 1}", "below 2**31 - 1")),
         ({"num_epochs": 2**31}, ("num_epochs", "below 2**31 - 1")),
