@@ -66,7 +66,8 @@ def _draw_task(panel: Any, seeds: Sequence[Seed], published: dict[str, float], a
         if column in published:
             panel.axhline(published[column], color=color, linewidth=1, linestyle="--", label=label)
     panel.set_ylim(0, BEST * 1.03)
-    panel.xaxis.set_major_formatter("{x:.3g}" if across == "seconds" else _in_millions)
+    if across == "steps":
+        panel.xaxis.set_major_formatter(_in_millions)
     panel.grid(alpha=0.3)
 
 
@@ -82,6 +83,7 @@ def draw_together(path: Path, tasks: dict[str, list[Seed]]) -> None:
     left.plot(steps, band.iqm, color="C0", linewidth=2)
     if band.low is not None:
         left.fill_between(steps, band.low, band.high, color="C0", alpha=0.2, linewidth=0)
+    left.xaxis.set_major_formatter(_in_millions)
     left.set(xlabel="control steps", ylabel="return", title=f"IQM of {len(tasks)} tasks")
     share, low, high = profile(tasks)
     right.plot(LEVELS, share, color="C0", linewidth=2)

@@ -1,8 +1,8 @@
 """Planning by sampling: predictive sampling, MPPI and the cross-entropy method, with one action.
 
-Before each action, N plans are drawn around the last one, each is played H steps ahead in the
-simulation, and what they returned makes the next plan, of which the first action is taken (a
-receding horizon). All three planners are a mean of the samples, theta' = sum_i w_i theta_i, and
+Before each action, N plans are drawn around the last one, and each is played H steps ahead in the
+simulation. What they returned makes the next plan, of which the first action is taken (a receding
+horizon). All three planners are a mean of the samples, theta' = sum_i w_i theta_i, and
 differ in the weights w alone:
 
 - predictive sampling (Howell et al. 2022, arXiv:2212.00541): 1 for the best sample. The last plan
