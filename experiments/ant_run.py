@@ -3,6 +3,7 @@
 python -m purerl.run ant_run
 
 Expected: 4.5 m/s after 3.6 min, on two CPU cores (seeds 2 and 3: 4.5 and 4.6 m/s).
+Ten seeds with MJX-Warp: 4.1 m/s at the lower quartile, 3.8 at least.
 """
 
 from envs import run

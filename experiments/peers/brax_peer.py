@@ -4,9 +4,9 @@
     python -m experiments.peers.brax_peer ant humanoid --json rates.json
     python -m experiments.peers.brax_peer ant --trainers brax    # with XLA's own choice of kernels
 
-Same observation, reward, end and start (brax's code, `experiments/peers/brax_env.py`), networks,
-environments, samples, minibatches and epochs; no evaluation and no checkpoint. Three lines of a
-table:
+Same observation, reward, end and start (brax's code, `experiments/peers/brax_env.py`), widths of
+networks, environments, samples, minibatches and epochs; no evaluation and no checkpoint. Three
+lines of a table:
 
     brax                      its own figure, "training/sps", between calls of its progress function
     purerl on brax's physics  MJX as brax calls it, the whole `mjx.Data` carried from step to step
@@ -15,9 +15,10 @@ table:
 A line's physics alone is that physics under random actions, from the same starts, without
 observation, reward or network; brax's is that of the second line. What differs by design is what
 each trainer does besides: ours draws a fresh start for each episode, takes MJX's matrix products in
-whole float32, and leaves no lambda out of the advantage.
+whole float32, and computes advantages once an update, where brax cuts what it has collected into
+unrolls and does so again in every minibatch.
 
-Whole training and its returns: `experiments/peers/brax_training.py`.
+Returns: `experiments/peers/brax_training.py`, ours with settings of our own.
 """
 
 import argparse
@@ -35,9 +36,9 @@ import jax.numpy as jnp
 
 from experiments.benchmarks.benchmark import Part, measure
 from experiments.benchmarks.output import output_file
-from experiments.peers import brax_env, brax_network
+from experiments.peers import brax_env
 from experiments.peers.sb3 import Ours
-from purerl import exact
+from purerl import exact, networks
 from purerl.core.records import Array, PyTree
 from purerl.devices import compilation
 from purerl.devices.programs import abstract_state, compile_programs
@@ -104,7 +105,6 @@ def our_experiment(body: str, physics: str, sizes: Published, num_steps: int) ->
         num_envs=sizes.num_envs,
         # brax takes several unrolls of each environment in turn, to fill its minibatches.
         rollout_length=sizes.samples // sizes.num_envs,
-        segment_length=sizes.unroll_length,
         num_epochs=sizes.num_updates_per_batch,
         num_minibatches=sizes.num_minibatches,
         episode_length=EPISODE_LENGTH,
@@ -116,8 +116,8 @@ def our_experiment(body: str, physics: str, sizes: Published, num_steps: int) ->
         reward_scale=sizes.reward_scaling,
     )
     options: Any = brax_env.Options(name=body, backend=physics)  # type: ignore[arg-type]
-    network = brax_network.Options(policy_hidden=sizes.policy, value_hidden=sizes.value)
-    return Experiment(brax_env.build, options, brax_network.build, network, config, engine="jax")
+    network = networks.MlpOptions(policy_hidden=sizes.policy, value_hidden=sizes.value, std="state")
+    return Experiment(brax_env.build, options, networks.mlp, network, config, engine="jax")
 
 
 def physics_alone(env: Any, num_steps: int, start: PyTree, key: Array) -> Array:

@@ -1,26 +1,25 @@
-"""brax's PPO beside ours: the whole training from cold, and the returns of several seeds.
+"""brax's PPO with its published settings, and its returns beside those of our own settings.
 
-    python -m experiments.peers.brax_training brax ant --seeds 0 1 2 3 4 --json brax_ant.json
-    python -m experiments.peers.brax_training purerl ant --seeds 0 1 2 3 4 --json purerl_ant.json
-    python -m experiments.peers.brax_training table brax_ant.json purerl_ant.json
+    python -m experiments.peers.brax_training train ant --seeds 0 1 2 3 4 --json brax_ant.json
+    python -m purerl.run experiments/peers/brax_ant.py --num-seeds 8 --seed 20
+    python -m experiments.peers.brax_training table ant brax_ant.json runs/brax_ant
 
-Settings are those of `experiments/peers/brax_peer.py`. One process trains with one trainer, so that
-neither finds the machine warmed by the other, and brax keeps XLA's own choice of kernels. With
-`purerl on brax's physics` and `purerl` it is the first or the third line of that table.
-
+brax's settings are those of `experiments/peers/brax_peer.py`; it keeps XLA's own choice of kernels.
 The first seed is from cold: an empty compilation cache (of its own folder, unless `--cache` names
 one), building and compiling included, importing not. Later seeds find what it compiled. Evaluations
 are of 128 episodes of the deterministic policy, the first one before training, as brax counts them.
 No run is begun after the time limit, and the file is written after every run.
+
+The table's seconds are of a run from its start; seeds that ran vmapped took them together.
 """
 
 import argparse
-import functools
 import importlib
 import json
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,24 +28,18 @@ import jax
 import numpy as np
 
 from experiments.benchmarks.output import output_file
-from experiments.peers.brax_peer import BODIES, Published, our_experiment, resize, train_brax
-from purerl import exact
+from experiments.peers.brax_peer import BODIES, Published, resize, train_brax
 from purerl.core.errors import UserError
-from purerl.devices.programs import Programs, compile_programs
-from purerl.devices.shards import Shards
-from purerl.ppo.config import Evaluation
-from purerl.report import bootstrap
-from purerl.runs import build_experiment
+from purerl.report import bootstrap, run_reader
 from purerl.runs.command_errors import leave
 
 NUM_EPISODES = 128
-PHYSICS = {"purerl": "purerl", "purerl-on-brax": "mjx"}  # ours -> whose
-TRAINERS = ("brax", *PHYSICS)
+METRIC = "eval/episode_return"
 
 
 @dataclass(frozen=True)
 class Task:
-    """What is trained, with whatever trainer."""
+    """What brax trains."""
 
     body: str
     sizes: Published
@@ -60,7 +53,7 @@ class Task:
 
 
 class Run(NamedTuple):
-    """One training; the first evaluation is before it."""
+    """One training; brax's first evaluation is before it."""
 
     trainer: str
     body: str
@@ -96,38 +89,6 @@ def run_brax(task: Task, seed: int) -> Run:
     return run
 
 
-@functools.cache
-def our_programs(task: Task, physics: str) -> Programs:
-    """Compiles our training, once in a process."""
-    chosen = our_experiment(task.body, physics, task.sizes, task.steps)
-    config, env, network, _ = build_experiment.build(chosen)
-    evaluation = Evaluation(num_episodes=NUM_EPISODES)
-    return compile_programs(config, env, network, evaluation, True, Shards())
-
-
-def run_ours(task: Task, trainer: str, seed: int) -> Run:
-    """Trains with our programs, called as `purerl.runs.loop` calls them."""
-    for name in ("brax.envs", "purerl.physics.engine_mjx"):
-        importlib.import_module(name)
-    begin = time.perf_counter()
-    run = Run(trainer, task.body, seed, False, [], [], [], [])
-    programs = our_programs(task, PHYSICS[trainer])
-    state = programs.init(jax.random.key(seed))
-    for stretch in range(task.stretches + 1):
-        if stretch:
-            start = time.perf_counter()
-            for _ in range(task.updates):
-                state, metrics = programs.update(state)
-            jax.device_get(metrics)
-            samples = task.updates * task.sizes.samples
-            run.rates.append(samples / (time.perf_counter() - start))
-        judged = jax.device_get(programs.evaluate(state))
-        run.steps.append(stretch * task.updates * task.sizes.samples)
-        run.seconds.append(time.perf_counter() - begin)
-        run.returns.append(float(np.mean(judged["episode_return"])))
-    return run
-
-
 def write(path: str, runs: list[Run]) -> None:
     """Writes the runs made so far."""
     found = {"device": jax.devices()[0].device_kind, "runs": [run._asdict() for run in runs]}
@@ -143,12 +104,12 @@ def train(options: argparse.Namespace) -> list[Run]:
     task = make_task(options.body, sizes, options.steps, options.evaluations)
     empty = not any(Path(options.cache).iterdir())
     jax.config.update("jax_compilation_cache_dir", options.cache)
-    jax.block_until_ready(jax.numpy.zeros(1))  # the device's own start is neither trainer's
+    jax.block_until_ready(jax.numpy.zeros(1))  # the device's own start is not the trainer's
     for seed in options.seeds:
         if time.perf_counter() - begin > options.time_limit:
             print(f"Time limit: seed {seed} and later ones are left out.", flush=True)
             break
-        run = run_brax(task, seed) if options.what == "brax" else run_ours(task, options.what, seed)
+        run = run_brax(task, seed)
         runs.append(run._replace(cold=empty and not runs))
         print(describe(runs[-1]), flush=True)
         write(options.json, runs)
@@ -158,37 +119,52 @@ def train(options: argparse.Namespace) -> list[Run]:
 def describe(run: Run) -> str:
     """Returns a run as one line."""
     curve = ", ".join(f"{value:.0f}" for value in run.returns)
+    rate = float(np.median(run.rates[2:] or run.rates[-1:]))  # brax compiles in the first two
     return (
         f"{run.trainer} {run.body} seed {run.seed}{' from cold' if run.cold else ''}: "
-        f"{run.seconds[-1]:.1f} s, steady {steady([run]):,.0f} steps/s, returns {curve}"
+        f"{run.seconds[-1]:.1f} s, steady {rate:,.0f} steps/s, returns {curve}"
     )
 
 
-def steady(runs: list[Run]) -> float:
-    """Returns the median rate of the stretches after the first two, in which brax compiles."""
-    rates = [rate for run in runs for rate in run.rates[2:] or run.rates[-1:]]
-    return float(np.median(rates))
+def read(body: str, path: str) -> list[Run]:
+    """Reads the runs of one body: what `--json` wrote of brax, or a run's folder, or several's."""
+    if Path(path).is_file():
+        runs = [Run(**run) for run in json.loads(Path(path).read_text())["runs"]]
+        return [run for run in runs if run.body == body]
+    records = [run_reader.read(folder) for folder in run_reader.find_runs([Path(path)])]
+    return [of_record(record) for record in records if record.settings.get("env.name") == body]
 
 
-def table(runs: list[Run]) -> str:
+def of_record(record: run_reader.RunRecord) -> Run:
+    """Returns one of our runs; UserError if it was never evaluated."""
+    lines = [line for line in record.lines if line.get(METRIC) is not None]
+    if not lines:
+        raise UserError(f"{record.path} has no {METRIC} yet; a row of the table is of evaluations.")
+    columns = ([line[name] for line in lines] for name in ("steps", "wall_s", METRIC))
+    return Run("purerl", record.settings["env.name"], record.seed, False, *columns, [])
+
+
+def table(runs: Sequence[Run]) -> str:
     """Formats one body's runs, a line a trainer; differences are to brax."""
     lines = [
-        "| trainer | from cold [s] | steady steps/s | seeds | final return, IQM | minus brax's |"
+        "| trainer | seeds | steps | seconds | return, IQM (least to greatest) | minus brax's |"
     ]
     lines.append("|---|---|---|---|---|---|")
-    final = {
-        trainer: np.array([run.returns[-1] for run in runs if run.trainer == trainer])
-        for trainer in TRAINERS
-    }
-    for trainer, values in final.items():
+    brax = np.array([run.returns[-1] for run in runs if run.trainer == "brax"])
+    for trainer in sorted({run.trainer for run in runs}):
         own = [run for run in runs if run.trainer == trainer]
-        if not own:
-            continue
-        cold = ", ".join(f"{run.seconds[-1]:.1f}" for run in own if run.cold) or "not measured"
-        iqm = float(bootstrap.interquartile_mean(values))
-        other = final["brax"] if trainer != "brax" else np.array([])
-        cells = (trainer, cold, f"{steady(own):,.0f}", str(len(own)), f"{iqm:.0f}")
-        lines.append(f"| {' | '.join((*cells, difference(values, other)))} |")
+        last = np.array([run.returns[-1] for run in own])
+        iqm = float(bootstrap.interquartile_mean(last))
+        seconds = np.median([run.seconds[-1] for run in own])
+        cells = (
+            trainer,
+            str(len(own)),
+            f"{np.median([run.steps[-1] for run in own]) / 1e6:.1f} M",
+            f"{seconds:.0f}",
+            f"{iqm:.0f} ({last.min():.0f} to {last.max():.0f})",
+            difference(last, brax if trainer != "brax" else np.array([])),
+        )
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -202,33 +178,24 @@ def difference(values: np.ndarray, others: np.ndarray) -> str:
     return f"{both:.0f}{bounds}"
 
 
-def read(paths: list[str]) -> list[Run]:
-    """Reads the runs of several files."""
-    missing = [path for path in paths if not Path(path).is_file()]
-    if missing:
-        raise UserError(
-            f"There is no file {', '.join(missing)}; `--json` of a training writes one."
-        )
-    return [Run(**run) for path in paths for run in json.loads(Path(path).read_text())["runs"]]
-
-
 def parse(arguments: list[str]) -> argparse.Namespace:
     """Reads the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     kinds = parser.add_subparsers(dest="what", required=True)
-    kinds.add_parser("table", help="of written files").add_argument("files", nargs="+")
-    for trainer in TRAINERS:
-        add = kinds.add_parser(trainer, help="train").add_argument
-        add("body", choices=tuple(BODIES))
-        add("--steps", type=int, default=31_129_600, help="rounded up")
-        add("--evaluations", type=int, default=6, help="with the first, before training")
-        add("--seeds", type=int, nargs="+", default=[0])
-        add("--time-limit", type=float, default=float("inf"), help="begin no run after it [s]")
-        add("--num-envs", type=int, default=0, help="0: as published; less for a try")
-        add("--cache", default="", help="compilation cache's folder; of its own unless given")
-        add("--json", type=output_file, default="", help="also write the runs to this file")
+    shown = kinds.add_parser("table", help="of brax's files and our runs").add_argument
+    shown("body", choices=tuple(BODIES))
+    shown("places", nargs="+", help="a file of --json, a run, or a folder of runs")
+    add = kinds.add_parser("train", help="with brax").add_argument
+    add("body", choices=tuple(BODIES))
+    add("--steps", type=int, default=31_129_600, help="rounded up")
+    add("--evaluations", type=int, default=6, help="with the first, before training")
+    add("--seeds", type=int, nargs="+", default=[0])
+    add("--time-limit", type=float, default=float("inf"), help="begin no run after it [s]")
+    add("--num-envs", type=int, default=0, help="0: as published; less for a try")
+    add("--cache", default="", help="compilation cache's folder; of its own unless given")
+    add("--json", type=output_file, default="", help="also write the runs to this file")
     return parser.parse_args(arguments)
 
 
@@ -236,12 +203,11 @@ def main(arguments: list[str]) -> int:
     """Trains, or prints the table of what was trained."""
     options = parse(arguments)
     if options.what == "table":
-        runs = read(options.files)
-        for body in sorted({run.body for run in runs}):
-            print(f"{body}\n\n{table([run for run in runs if run.body == body])}\n")
+        runs = [run for place in options.places for run in read(options.body, place)]
+        if not runs:
+            raise UserError(f"{', '.join(options.places)} has no run of {options.body}.")
+        print(table(runs))
         return 0
-    if options.what != "brax":
-        exact.set_xla_flags()  # before JAX starts
     with tempfile.TemporaryDirectory() as folder:
         options.cache = options.cache or folder
         Path(options.cache).mkdir(parents=True, exist_ok=True)

@@ -29,19 +29,9 @@ def check_minibatches(config: Config, recurrent: bool, size: int, name: str = "n
 
     Those of a `recurrent` network hold whole rollouts.
     """
-    if config.segment_length:
-        length = ("segment_length", config.segment_length)
-        check_divides("rollout_length", config.rollout_length, *length)
-    if config.segment_length and recurrent:
-        raise ValueError(
-            f"segment_length is {config.segment_length}, and the network is recurrent, so that its "
-            "minibatches hold whole rollouts; segment_length must be 0."
-        )
     because = " The minibatches of a recurrent network hold whole rollouts." if recurrent else ""
     if not recurrent:
         size, name = size * config.rollout_length, f"{name} * rollout_length"
-    if config.segment_length:
-        size, name = size // config.segment_length, f"{name} / segment_length"
     check_divides(name, size, "num_minibatches", config.num_minibatches, because)
 
 

@@ -24,7 +24,7 @@ def count_slices(config: Config, size: int, recurrent: bool, platform: str) -> i
     """
     if platform != "gpu":
         return 1
-    columns = 1 if recurrent else config.rollout_length // (config.segment_length or 1)
+    columns = 1 if recurrent else config.rollout_length
     samples = size * config.rollout_length // config.num_minibatches
     for n in (16, 8, 4, 2):
         whole = size % n == 0 and size // n * columns % config.num_minibatches == 0

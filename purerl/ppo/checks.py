@@ -15,7 +15,7 @@ TRAINING = (
     ("in [0, 1]", lambda x: 0.0 <= x <= 1.0, "gamma gae_lambda"),
     ("above 0, and finite", lambda x: 0.0 < x < math.inf, "learning_rate desired_kl reward_scale"),
     ("above 0, and finite", lambda x: 0.0 < x < math.inf, "clip max_gradient_norm"),
-    ("0 or above", lambda x: 0.0 <= x < math.inf, "value_weight entropy_weight segment_length"),
+    ("0 or above", lambda x: 0.0 <= x < math.inf, "value_weight entropy_weight"),
     ("0 or above", lambda x: 0.0 <= x < math.inf, "shortest_episode advantage_clip"),
 )
 EVALUATION = (

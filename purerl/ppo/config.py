@@ -29,10 +29,6 @@ class Config:
     """Discount of one control step."""
     gae_lambda: float = 0.95
     """Decay of the advantage trace, lambda."""
-    segment_length: int = 0
-    """Steps of the segments into which rollouts are cut (brax's unroll_length). Minibatches hold
-    whole segments. Each gradient step computes their advantages and value targets anew, with the
-    values of that moment. 0: once an update, over whole rollouts."""
     clip: float = 0.2
     """Range of the policy ratio, 1 +- clip."""
     advantage_clip: float = 0.0

@@ -11,7 +11,7 @@ from purerl.core.keys import Purpose, derive
 from purerl.core.parts import Parts
 from purerl.core.records import Array, Metrics, Network, PolicyOutput, PyTree, TrainState
 from purerl.ppo import distributions, losses
-from purerl.ppo.batches import Batch, in_one_row, in_segments, renew
+from purerl.ppo.batches import Batch, in_one_row
 from purerl.ppo.config import Config
 from purerl.ppo.optimizer import next_rate, optimizer, scheduled_rate
 from purerl.ppo.rollout import select
@@ -46,13 +46,13 @@ def learn(
     Each part shuffles its own samples of a rollout, [V, T, B, ...], by the number of its `first`
     environment [V], and has an equal share of every minibatch. `memory` [V, B, H] opens it.
     """
-    batch = jax.vmap(functools.partial(arrange, config, is_recurrent(memory)))(batch)
+    batch = jax.vmap(functools.partial(arrange, is_recurrent(memory)))(batch)
     columns = batch.weight.shape[-1]
     rate = scheduled_rate(config, state)
     learner = Learner(state.params, state.optimizer, rate, state.skipped_in_a_row)
     key = derive(state.key, Purpose.PERMUTATION, state.update)
 
-    def step(learner: Learner, chosen: tuple[Array, Moments | None]) -> tuple[Learner, Metrics]:
+    def step(learner: Learner, chosen: tuple[Array, Moments]) -> tuple[Learner, Metrics]:
         index, scale = chosen
         minibatch, start = jax.vmap(take_columns)(batch, memory, index)
         return minibatch_step(config, network, learner, minibatch, start, scale, parts)
@@ -60,7 +60,7 @@ def learn(
     def epoch(learner: Learner, number: Array) -> tuple[Learner, Metrics]:
         epoch_key = jax.random.fold_in(key, number)
         order = shuffle(epoch_key, first, columns, config.num_minibatches)
-        scales = None if config.segment_length else advantage_scales(batch, order, parts)
+        scales = advantage_scales(batch, order, parts)
         return jax.lax.scan(step, learner, (jnp.swapaxes(order, 0, 1), scales))
 
     learner, metrics = jax.lax.scan(epoch, learner, jnp.arange(config.num_epochs))
@@ -76,13 +76,11 @@ def learn(
     return state.replace(**learner._asdict()), metrics
 
 
-def arrange(config: Config, recurrent: bool, batch: Batch) -> Batch:
+def arrange(recurrent: bool, batch: Batch) -> Batch:
     """Lays one part's rollout [T, B] out in columns, of which minibatches take some.
 
-    Columns are segments, whole rollouts of a network with memory, or single samples.
+    Columns are whole rollouts of a network with memory, or single samples.
     """
-    if config.segment_length:
-        return in_segments(config.segment_length, batch)
     return batch if recurrent else in_one_row(batch)
 
 
@@ -175,19 +173,13 @@ def minibatch_step(
     learner: Learner,
     batch: Batch,
     memory: PyTree,
-    scale: Moments | None,
+    scale: Moments,
     parts: Parts,
 ) -> tuple[Learner, Metrics]:
     """Makes one gradient step; a step with a number that is not finite is skipped and counted.
 
-    The minibatch is [V, T', M, ...], its memory [V, M, H]. `scale` is of its advantages; without
-    one, it consists of segments, whose advantages are estimated anew.
+    The minibatch is [V, T', M, ...], its memory [V, M, H]. `scale` is of its advantages.
     """
-    if scale is None:
-        anew = functools.partial(renew, config, network, learner.params)
-        batch = parts.map(anew, batch, memory)
-        found = parts.map(moments, batch.advantage, batch.weight > 0)
-        scale = pool(parts.gather(found))
 
     def gradient(batch: Batch, memory: PyTree) -> tuple[tuple[Array, Metrics], PyTree]:
         def objective(params: PyTree) -> tuple[Array, Metrics]:

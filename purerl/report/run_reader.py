@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from purerl.core.errors import UserError
 from purerl.ppo.config import Config
 from purerl.runs.files import (
+    REMOVED,
     check_is_run,
     check_object,
     read_bytes,
@@ -119,6 +120,6 @@ def _flatten(value: Any, path: str = "") -> dict[str, Any]:
 
 def _planned_updates(ppo: dict[str, Any]) -> int | None:
     try:
-        return Config(**ppo).num_updates
+        return Config(**{k: v for k, v in ppo.items() if k not in REMOVED}).num_updates
     except (TypeError, ValueError, ArithmeticError):  # the settings of another version
         return None

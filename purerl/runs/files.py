@@ -25,6 +25,7 @@ from purerl.core.errors import UserError, one_line
 LARGEST = 16 << 20  # [bytes] of a JSON file
 LARGEST_METRICS = 1 << 30  # [bytes] of metrics.jsonl
 LONGEST_NAME = 200  # [bytes]; most file systems take 255, and a seed's number may follow
+REMOVED = ("segment_length",)  # settings of PPO in the config.json of older runs
 DEEPEST = 50  # objects and lists in each other; Python's own recursion ends at some hundreds
 KINDS = {
     dict: "an object {name: value}", list: "a list", str: "a string", int: "a whole number",

@@ -26,14 +26,6 @@ def test_minibatches_divide_the_rollout(recurrent, minibatches, words):
     assert all(word in said for word in words)
 
 
-def test_segments_divide_rollouts_and_are_not_for_recurrent_networks():
-    said = unfit(False, segment_length=8, num_minibatches=16)
-    assert "num_envs * rollout_length / segment_length = 12" in said
-    assert "segment_length is 8, and the network is recurrent" in unfit(True, segment_length=8)
-    said = unfit(False, segment_length=5)
-    assert all(word in said for word in ("segment_length = 5", "rollout_length = 16", "4"))
-
-
 @pytest.mark.timeout(20)
 def test_the_sizes_of_a_huge_rollout_are_found_at_once():
     """One after another, 2**31 numbers took minutes."""

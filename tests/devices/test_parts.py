@@ -24,14 +24,14 @@ CUTS = {
 }
 
 
-def columns(recurrent, segment_length):
+def columns(recurrent):
     """All columns of a rollout in 12 environments, [T', C], and what made them."""
-    config = dataclasses.replace(CONFIG, segment_length=segment_length, num_envs=12)
+    config = dataclasses.replace(CONFIG, num_envs=12)
     env, network, state = setup(config, recurrent=recurrent)
     memory = state.carry  # before the rollout
     after, transitions, _, last_value = ROLLOUT(config, env, network, state)
     batch = batches.make_batch(config, after, transitions, last_value, state.episode.length == 0)
-    return config, network, after, learner.arrange(config, recurrent, batch), memory
+    return config, network, after, learner.arrange(recurrent, batch), memory
 
 
 def cut(number, axis, tree):
@@ -40,9 +40,9 @@ def cut(number, axis, tree):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CUTS)
-@pytest.mark.parametrize("recurrent, segment_length", [(False, 0), (True, 0), (False, 4)])
-def test_a_gradient_step_is_the_same_in_parts(name, recurrent, segment_length):
-    config, network, state, batch, memory = columns(recurrent, segment_length)
+@pytest.mark.parametrize("recurrent", [False, True])
+def test_a_gradient_step_is_the_same_in_parts(name, recurrent):
+    config, network, state, batch, memory = columns(recurrent)
     number, parts = CUTS[name]
     begin = learner.Learner(
         state.params, state.optimizer, state.learning_rate, state.skipped_in_a_row
@@ -50,11 +50,9 @@ def test_a_gradient_step_is_the_same_in_parts(name, recurrent, segment_length):
 
     def step(number, parts):
         pieces, memories = cut(number, 1, batch), cut(number, 0, memory)
-        scale = None
-        if not segment_length:
-            size = pieces.weight.shape[2]
-            order = jnp.tile(jnp.arange(size), (number, 1, 1))  # one minibatch of all columns
-            scale = jax.tree.map(lambda x: x[0], learner.advantage_scales(pieces, order, parts))
+        size = pieces.weight.shape[2]
+        order = jnp.tile(jnp.arange(size), (number, 1, 1))  # one minibatch of all columns
+        scale = jax.tree.map(lambda x: x[0], learner.advantage_scales(pieces, order, parts))
         return learner.minibatch_step(config, network, begin, pieces, memories, scale, parts)
 
     whole, metrics = step(1, WHOLE)
@@ -107,7 +105,6 @@ def test_advantages_of_a_minibatch_are_scaled_by_its_own(name):
         (15, {"rollout_length": 17, "num_minibatches": 1}, False, "gpu", 1),
         (64, {"rollout_length": 32, "num_minibatches": 1}, True, "gpu", 8),  # whole rollouts
         (64, {"rollout_length": 320, "num_minibatches": 16}, True, "gpu", 4),  # 4 minibatches each
-        (64, {"rollout_length": 32, "segment_length": 16, "num_minibatches": 1}, False, "gpu", 8),
     ],
 )
 def test_slices_are_equal_and_not_too_small(size, changes, recurrent, platform, number):

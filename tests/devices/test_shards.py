@@ -133,8 +133,8 @@ def test_by_default_every_device_has_a_shard(tmp_path):
 
 @pytest.mark.slow
 def test_the_check_of_a_persons_own_devices():
-    """Its short form, on two virtual ones, of segments."""
-    words = ["2", "--", str(TOY), "--ppo.segment-length", "2", *TRAINING]
+    """Its short form, on two virtual ones."""
+    words = ["2", "--", str(TOY), *TRAINING]
     said = subprocess.run(
         [sys.executable, "-m", "tests.checks.shards", *words],
         cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True, timeout=200,

@@ -1,5 +1,7 @@
 """Other trainers beside ours: the same thing is simulated, and the same sizes are learned."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ pytest.importorskip("gymnasium", reason="needs the extra peers")
 import gymnasium  # noqa: E402
 
 from envs import gymnasium_ant  # noqa: E402
+from purerl.core.errors import UserError  # noqa: E402
 from purerl.runs.check_env import check_env  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -133,7 +136,6 @@ def test_braxs_settings_make_the_same_update(body):
     assert sizes.batch_size * sizes.num_minibatches % sizes.num_envs == 0  # brax's own rule
     minibatch = config.steps_per_update // config.num_minibatches
     assert minibatch == sizes.batch_size * sizes.unroll_length
-    assert config.segment_length == sizes.unroll_length
 
 
 @pytest.mark.parametrize("body", ["ant", "humanoid"])
@@ -181,34 +183,34 @@ def test_the_difference_of_returns_has_an_interval_from_five_seeds_on():
     assert brax_training.difference(ours[:4], theirs) == "100, too few seeds"
 
 
-def test_braxs_network_is_braxs():
-    """The same parameters give the same policy and value, and begin alike."""
-    pytest.importorskip("brax", reason="needs the extra peers")
-    from brax.training.agents.ppo import networks as brax_networks
+def test_our_runs_stand_beside_braxs(tmp_path, capsys):
+    """Runs of another body are left out; one without an evaluation is told."""
+    from experiments.peers import brax_training
 
-    from experiments.peers import brax_network
-
-    theirs = brax_networks.make_ppo_networks(
-        27, 8, policy_hidden_layer_sizes=(32,) * 4, value_hidden_layer_sizes=(256,) * 5
-    )
-    keys = jax.random.split(jax.random.key(0), 2)
-    policy, value = theirs.policy_network.init(keys[0]), theirs.value_network.init(keys[1])
-    ours = brax_network.build(brax_network.Options(), jnp.zeros(27), 8)
-    begun, carry = ours.init(jax.random.key(1))
-    params = {"params": {"policy": policy["params"], "value": value["params"]}}
-    for name, own, other in zip(
-        map(str, jax.tree.leaves_with_path(begun)),
-        jax.tree.leaves(begun),
-        jax.tree.leaves(params),
-        strict=True,
-    ):
-        assert own.shape == other.shape, name
-        np.testing.assert_allclose(own.std(), other.std(), rtol=0.2, err_msg=name)
-    observation = jax.random.normal(jax.random.key(2), (5, 27))
-    output, _ = ours.apply(params, observation, carry)
-    logits = theirs.policy_network.apply(None, policy, observation)
-    expected = theirs.parametric_action_distribution.create_dist(logits)
-    np.testing.assert_allclose(output.distribution.loc, expected.loc, atol=1e-5)
-    np.testing.assert_allclose(output.distribution.scale, expected.scale, atol=1e-5)
-    theirs_value = theirs.value_network.apply(None, value, observation)
-    np.testing.assert_allclose(output.value, theirs_value, atol=1e-4)
+    run = brax_training.Run("brax", "ant", 0, False, [0, 10], [1.0, 30.0], [0.0, 100.0], [])
+    theirs = [run._replace(seed=i, returns=[0.0, 100.0 + i])._asdict() for i in range(5)]
+    theirs.append(run._replace(body="humanoid", returns=[0.0, 900.0])._asdict())
+    file = tmp_path / "brax.json"
+    file.write_text(json.dumps({"runs": theirs}))
+    for seed in range(5):
+        folder = tmp_path / "runs" / f"seed{seed}"
+        folder.mkdir(parents=True)
+        settings = {"seed": seed, "ppo": {}, "env": {"name": "ant"}}
+        (folder / "config.json").write_text(json.dumps({"experiment": "x", "settings": settings}))
+        (folder / "manifest.json").write_text("{}")
+        (folder / "experiment.py").write_text("")
+        line = {
+            "update": 3,
+            "steps": 4_000_000,
+            "wall_s": 60.0,
+            "eval/episode_return": 200.0 + seed,
+        }
+        (folder / "metrics.jsonl").write_text(json.dumps(line) + "\n")
+    words = ["table", "ant", str(file), str(tmp_path / "runs")]
+    assert brax_training.main(words) == 0
+    brax, ours = capsys.readouterr().out.splitlines()[2:]
+    assert brax.startswith("| brax | 5 | 0.0 M | 30 | 102 (100 to 104) |")
+    assert ours.startswith("| purerl | 5 | 4.0 M | 60 | 202 (200 to 204) | 100 [")
+    (folder / "metrics.jsonl").write_text(json.dumps({"update": 3, "steps": 4}) + "\n")
+    with pytest.raises(UserError, match="seed4 has no eval/episode_return"):
+        brax_training.main(words)

@@ -1,4 +1,4 @@
-"""A cart-pole whose value function sees more than its policy, trained by segments."""
+"""A cart-pole whose value function sees more than its policy."""
 
 from dataclasses import dataclass
 
@@ -56,7 +56,6 @@ experiment = Experiment(
         num_steps=768,
         num_envs=16,
         rollout_length=16,
-        segment_length=8,
         num_epochs=2,
         num_minibatches=4,
         episode_length=20,

@@ -211,65 +211,6 @@ def test_truncation_bootstraps_from_the_observation_before_the_reset():
     assert first[0].all()
 
 
-@pytest.mark.parametrize("length", [4, 16])
-def test_segments_are_estimated_from_the_values_of_now(length):
-    """Each segment against the slow reference: it bootstraps where it ends, from new parameters."""
-    config = dataclasses.replace(CONFIG, segment_length=length)
-    env, network, state = setup(env=Walk(edge=1.5))
-    after, transitions, _, last_value = ROLLOUT(config, env, network, state)
-    batch = batches.make_batch(config, after, transitions, last_value, state.episode.length == 0)
-    params = jax.tree.map(lambda x: 1.5 * x + 0.1, state.params)
-    segments = batches.in_segments(length, batch)
-    renewed = batches.renew(config, network, params, segments, ())
-    np.testing.assert_array_equal(renewed.log_prob, segments.log_prob.reshape(1, -1))
-    advantage = renewed.advantage.reshape(length, -1)
-    target = renewed.target.reshape(length, -1)
-
-    def value_of(features):
-        return np.asarray(network.apply(params, features, ())[0].value)
-
-    moved = transitions.observation[..., 0] + np.tanh(transitions.raw_action[..., 0])
-    last = value_of(running_moments.normalize(state.normalizer, after.env.observation))
-    values = value_of(batch.observation)
-    following = np.concatenate([values[1:], last[None]])
-    now = jax.tree.map(np.asarray, transitions._replace(value=values))
-
-    def kept_value(observation):  # at a truncation: that of the policy that acted
-        features = running_moments.normalize(state.normalizer, jnp.asarray(observation))
-        return float(network.apply(state.params, features, ())[0].value)
-
-    for i in range(0, 16, length):
-        part = jax.tree.map(lambda x, i=i: x[i : i + length], now)
-        before_reset = np.stack([moved, moved**2], -1)[i : i + length]
-        end = following[i + length - 1]
-        expected = slow_batch(part, end, before_reset, kept_value, 0.9, config.gae_lambda)
-        columns = slice(i // length * 6, (i // length + 1) * 6)
-        np.testing.assert_allclose(advantage[:, columns], expected, rtol=1e-4, atol=1e-5)
-        np.testing.assert_allclose(target[:, columns], expected + part.value, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.slow
-def test_segments_stay_whole_and_are_renewed_before_each_gradient_step(monkeypatch):
-    config = dataclasses.replace(CONFIG, segment_length=4)
-    env, network, state = setup()
-    seen = []
-
-    def spy(config, network, params, batch, memory):
-        jax.debug.callback(lambda *x: seen.append(x), params, batch.course.reward)
-        return batches.renew(config, network, params, batch, memory)
-
-    monkeypatch.setattr(learner, "renew", spy)
-    jax.block_until_ready(jax.jit(partial(algorithm.update, config, env, network))(state))
-    jax.effects_barrier()
-    assert len(seen) == config.num_epochs * config.num_minibatches
-    firsts = {np.asarray(jax.tree.leaves(params)[0]).tobytes() for params, _ in seen}
-    assert len(firsts) == len(seen)
-    _, transitions, _, _ = ROLLOUT(CONFIG, env, network, state)
-    whole = np.asarray(transitions.reward).reshape(4, 4, 6).swapaxes(0, 1).reshape(4, -1)
-    epoch = np.concatenate([reward for _, reward in seen[: config.num_minibatches]], axis=1)
-    assert {column.tobytes() for column in epoch.T} == {column.tobytes() for column in whole.T}
-
-
 @pytest.mark.slow
 def test_recurrent_memory_restarts_with_each_episode_in_rollout_and_learner():
     """The learner's unroll, from the stored memory, gives the rollout's values bit for bit."""
@@ -514,7 +455,6 @@ def test_update_keeps_rank_promotion_strict():
         ({"gamma": 1.5}, ("gamma is 1.5", "[0, 1]")),
         ({"num_envs": 0}, ("num_envs is 0", "at least 1")),
         ({"clip": 0.0}, ("clip is 0.0", "above 0")),
-        ({"segment_length": -4}, ("segment_length is -4", "0 or above")),
         ({"num_steps": 2**53 + 1}, ("num_steps is 9007199254740993", "at most 2**53")),
         ({"num_steps": 96 * 2**31}, ("2**31 updates or more", "= 96", "lower num_steps")),
         ({"shortest_episode": -1}, ("shortest_episode is -1", "0 or above")),

@@ -13,6 +13,7 @@ from scipy import stats
 
 from purerl import compare, run
 from purerl.core.errors import FAILURE, USAGE
+from purerl.report import run_reader
 
 ROOT = Path(__file__).parent.parent.parent
 TOY = ROOT / "tests" / "runs" / "toy_experiment.py"
@@ -165,6 +166,14 @@ def test_failed_runs_count_and_unfinished_ones_do_not(tmp_path, capsys):
     assert group["worst"] == 2.0 and group["worst_run"].endswith("exploded")
     said = capsys.readouterr().out
     assert "1 unfinished runs are left out." in said and "Failed runs" in said
+
+
+def test_an_older_run_with_a_setting_that_is_gone_is_unfinished_too(tmp_path):
+    folder = make_run(tmp_path / "one", 1, [1.0, 2.0])
+    config = json.loads((folder / "config.json").read_text())
+    config["settings"]["ppo"]["segment_length"] = 4
+    (folder / "config.json").write_text(json.dumps(config))
+    assert run_reader.read(folder).status == "unfinished"
 
 
 def test_groups_can_be_chosen_and_what_is_left_aside_makes_strata(tmp_path):

@@ -129,6 +129,7 @@ def test_a_setting_and_code_that_came_after_the_run_are_told(tmp_path, capsys):
     settings, facts = trained / "config.json", trained / "manifest.json"
     older = json.loads(settings.read_text())
     del older["settings"]["ppo"]["desired_kl"]
+    older["settings"]["ppo"]["segment_length"] = 4  # of training alone; the code has it no more
     settings.write_text(json.dumps(older))
     facts.write_text(json.dumps(json.loads(facts.read_text()) | {"source": {}}))
     assert result(trained, tmp_path)["update"] == 12
