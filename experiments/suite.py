@@ -12,7 +12,12 @@ experiment = Experiment(
     build_env=tasks.build,
     env=tasks.Options(),
     build_network=networks.mlp,
-    network=networks.MlpOptions(policy_hidden=(128, 128), value_hidden=(128, 128), initial_std=1.0),
+    network=networks.MlpOptions(
+        policy_hidden=(128, 128),
+        value_hidden=(128, 128),
+        initial_std=1.0,
+        min_std=0.2,  # with 0.001, a cart-pole's was 0.04, steps became leaps, and the pole fell
+    ),
     ppo=Config(
         num_steps=3_000_000,
         num_envs=64,
@@ -23,7 +28,7 @@ experiment = Experiment(
         learning_rate=1e-3,
         schedule="linear",
         advantage_clip=4.0,  # without it, one fall of a pole that always stood undid a policy
-        entropy_weight=0.01,  # without it, seeds of the cart-pole balanced and then forgot it
+        entropy_weight=0.003,  # 0.01 holds a hopper down
         reward_scaling="return_std",
         reward_scale=1.0,
     ),

@@ -14,7 +14,7 @@ experiment = Experiment(
     env=brax_env.Options(name="ant", backend="purerl"),
     build_network=networks.mlp,
     network=networks.MlpOptions(policy_hidden=(128, 128), value_hidden=(128, 128), initial_std=1.0),
-    ppo=Config(  # those of `experiments/suite.py`
+    ppo=Config(
         num_steps=10_000_000,
         num_envs=64,
         rollout_length=64,

@@ -14,8 +14,6 @@ import jax.numpy as jnp
 from purerl.core.records import Array, Network, Normal, PolicyOutput, PyTree
 from purerl.ppo.checks import check_observation
 
-MIN_SCALE = 1e-3  # a policy of scale 0 has an infinite density
-
 
 @dataclass(frozen=True)
 class PolicyOptions:
@@ -26,12 +24,17 @@ class PolicyOptions:
     std: Literal["learned", "state"] = "learned"
     """Policy scale: one learned vector, or a function of the observation."""
     initial_std: float = 0.6
-    """Policy scale before training, in raw-action units."""
+    """Policy scale before training, above `min_std`, in raw-action units."""
+    min_std: float = 1e-3
+    """Least policy scale: what is learned is added to it. 0.2 keeps a policy whose episodes have
+    become all alike from changing by leaps."""
 
     def __post_init__(self) -> None:
         """Raises ValueError for a scale or a width that is none."""
-        if not MIN_SCALE <= self.initial_std <= 100.0:
-            raise ValueError(f"initial_std is {self.initial_std}; it must be {MIN_SCALE} to 100.")
+        if not 1e-6 <= self.min_std <= 100.0:  # a policy of scale 0 has an infinite density
+            raise ValueError(f"min_std is {self.min_std}; it must be 1e-6 to 100.")
+        if not 1e-3 <= self.initial_std <= 100.0:
+            raise ValueError(f"initial_std is {self.initial_std}; it must be 0.001 to 100.")
         for name in {"policy_hidden", "value_hidden", "hidden", "encoder"} & vars(self).keys():
             if min(jax.tree.leaves(x := vars(self)[name]), default=1) < 1:
                 raise ValueError(f"{name} is {x}; a layer has at least 1 unit.")
@@ -90,9 +93,8 @@ class Stack(nn.Module):
 class GaussianHead(nn.Module):
     """Features [..., H] to a Gaussian over raw actions [..., A]; starts near mean 0."""
 
+    options: PolicyOptions
     action_size: int
-    std: str
-    initial_std: float
 
     @nn.compact
     def __call__(self, x: Array) -> Normal:
@@ -100,12 +102,12 @@ class GaussianHead(nn.Module):
         # Nearly zero weights: the first policy explores alike everywhere.
         small = nn.initializers.variance_scaling(1e-4, "fan_in", "truncated_normal")
         loc = nn.Dense(self.action_size, kernel_init=small, name="loc")(x)
-        if self.std == "state":
+        if self.options.std == "state":
             raw = nn.Dense(self.action_size, kernel_init=small, name="scale")(x)
         else:
             raw = self.param("scale", nn.initializers.zeros, (self.action_size,))
-        inverse_softplus = math.log(math.expm1(self.initial_std))
-        scale = jax.nn.softplus(raw + inverse_softplus) + MIN_SCALE
+        inverse_softplus = math.log(math.expm1(self.options.initial_std))
+        scale = jax.nn.softplus(raw + inverse_softplus) + self.options.min_std
         return Normal(loc=loc, scale=jnp.broadcast_to(scale, loc.shape))
 
 
@@ -120,7 +122,7 @@ class MlpActorCritic(nn.Module):
         """Applies both towers to observations, leaves [..., O]."""
         o = self.options
         policy = Stack(o.policy_hidden, o.activation, name="policy")(policy_features(observation))
-        normal = GaussianHead(self.action_size, o.std, o.initial_std, name="head")(policy)
+        normal = GaussianHead(o, self.action_size, name="head")(policy)
         value = Stack(o.value_hidden, o.activation, name="value")(value_features(observation))
         return PolicyOutput(normal, nn.Dense(1, name="value_out")(value)[..., 0])
 
@@ -138,7 +140,7 @@ class RecurrentActorCritic(nn.Module):
         encoded = Stack(o.encoder, o.activation, name="encoder")(policy_features(observation))
         cell = {"gru": nn.GRUCell, "lstm": nn.OptimizedLSTMCell}[o.cell](o.hidden, name="cell")
         carry, memory = cell(carry, encoded)
-        normal = GaussianHead(self.action_size, o.std, o.initial_std, name="head")(memory)
+        normal = GaussianHead(o, self.action_size, name="head")(memory)
         features = jnp.concatenate([memory, value_features(observation)], axis=-1)
         value = Stack(o.value_hidden, o.activation, name="value")(features)
         return PolicyOutput(normal, nn.Dense(1, name="value_out")(value)[..., 0]), carry

@@ -340,6 +340,20 @@ def unmade(function, *arguments):
     return str(error.value)
 
 
+@pytest.mark.parametrize("std", ["learned", "state"])
+def test_the_scale_of_a_policy_stays_above_its_least(std):
+    options = networks.MlpOptions(
+        policy_hidden=(8,), value_hidden=(8,), std=std, initial_std=0.5, min_std=0.2
+    )
+    network = networks.mlp(options, jnp.zeros(2), 3)
+    params, memory = network.init(jax.random.key(0))
+    begun = network.apply(params, jnp.zeros((4, 2)), memory)[0].distribution.scale
+    np.testing.assert_allclose(begun, 0.7, atol=1e-3)
+    pressed = jax.tree.map(lambda x: x - 100.0, params)  # its logarithm is far below 0
+    least = network.apply(pressed, jnp.zeros((4, 2)), memory)[0].distribution.scale
+    np.testing.assert_allclose(least, 0.2, atol=1e-6)
+
+
 def test_what_a_network_cannot_read_is_told():
     zeros = jnp.zeros(2)
     said = unmade(networks.mlp, MLP, {"state": zeros, "privileged": zeros}, 1)
@@ -349,6 +363,7 @@ def test_what_a_network_cannot_read_is_told():
     )
     assert "part eyes is a dict" in unmade(networks.mlp, MLP, {"policy": zeros, "eyes": {}}, 1)
     assert "initial_std is 0.0" in unmade(lambda: networks.MlpOptions(initial_std=0.0))
+    assert "min_std is 0.0" in unmade(lambda: networks.MlpOptions(min_std=0.0))
     assert "starts an episode at zero" in unmade(
         networks.from_linen, networks.RecurrentActorCritic(GRU, 1), zeros, jnp.ones(8)
     )
