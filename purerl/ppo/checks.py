@@ -17,6 +17,7 @@ TRAINING = (
     ("above 0, and finite", lambda x: 0.0 < x < math.inf, "clip max_gradient_norm"),
     ("0 or above", lambda x: 0.0 <= x < math.inf, "value_weight entropy_weight"),
     ("0 or above", lambda x: 0.0 <= x < math.inf, "shortest_episode advantage_clip"),
+    ("finite", math.isfinite, "entropy_target"),
 )
 EVALUATION = (
     (*SIZE, "num_episodes"),

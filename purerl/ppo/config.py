@@ -37,6 +37,9 @@ class Config:
     """Weight of the value loss."""
     entropy_weight: float = 0.0
     """Weight of the entropy bonus."""
+    entropy_target: float = 1.0
+    """Entropy up to which there is a bonus [nats for each action]. A uniform policy has 0.69, so
+    that 1 is always; below, a policy that explores already is left to what it earns."""
     max_gradient_norm: float = 1.0
     """Gradients are scaled down to this global norm."""
     learning_rate: float = 3e-4

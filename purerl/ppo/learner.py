@@ -141,7 +141,7 @@ def unroll(network: Network, params: PyTree, batch: Batch, memory: PyTree) -> Po
 def loss(
     config: Config, network: Network, params: PyTree, scale: Moments, batch: Batch, memory: PyTree
 ) -> tuple[Array, Metrics]:
-    """Returns policy loss + value_weight * value loss - entropy_weight * entropy, [], and metrics.
+    """Returns policy loss + value_weight * value loss - entropy_weight * bonus, [], and metrics.
 
     Of one part of a minibatch whose advantages have the moments `scale`. Their sum over all parts
     is the minibatch's loss.
@@ -159,10 +159,12 @@ def loss(
     }
     number = jnp.maximum(scale.number.astype(jnp.float32), 1.0)
     means = {k: (batch.weight * term).sum() / number for k, term in terms.items()}
+    size = batch.raw_action.shape[-1]
+    bonus = losses.bounded_entropy(terms["entropy"], size, config.entropy_target)
     objective = (
         means["policy_loss"]
         + config.value_weight * means["value_loss"]
-        - config.entropy_weight * means["entropy"]
+        - config.entropy_weight * (batch.weight * bonus).sum() / number
     )
     return objective, means
 

@@ -3,6 +3,8 @@
 Every mean is weighted: `weight` is 1 for a sound sample and 0 for one whose physics blew up.
 """
 
+import math
+
 import jax.numpy as jnp
 
 from purerl.core.parts import Parts
@@ -30,6 +32,12 @@ def clipped_surrogate(log_ratio: Array, advantage: Array, clip: float) -> Array:
 def value_loss(value: Array, target: Array) -> Array:
     """Returns (V - G)^2 / 2, elementwise."""
     return 0.5 * jnp.square(value - target)
+
+
+def bounded_entropy(entropy: Array, action_size: int, target: float) -> Array:
+    """Returns the entropy [nats], where it is at most `target` for each action, elementwise."""
+    uniform = math.log(2.0)  # of actions in [-1, 1]: the greatest
+    return jnp.minimum(entropy, target * action_size) if target < uniform else entropy
 
 
 def approximate_kl(log_ratio: Array) -> Array:

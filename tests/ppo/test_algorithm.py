@@ -313,6 +313,21 @@ def test_advantages_are_clipped_after_they_are_normalized(clip):
     np.testing.assert_allclose(metrics["policy_loss"], -given.mean(), atol=1e-6)
 
 
+def test_the_entropy_bonus_leaves_a_policy_alone_that_is_above_its_target():
+    env, network, state = setup()
+    _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
+    batch = batches.make_batch(CONFIG, state, transitions, last_value, state.episode.length == 0)
+
+    def moved(**settings):
+        config = dataclasses.replace(CONFIG, num_epochs=1, num_minibatches=1, **settings)
+        return np.concatenate([x.ravel() for x in jax.tree.leaves(
+            learn(config, network, state, batch, ())[0].params)])  # fmt: skip
+
+    none = moved(entropy_weight=0.0)  # its entropy is about 0.5
+    np.testing.assert_allclose(moved(entropy_weight=1.0, entropy_target=0.1), none, atol=1e-7)
+    assert np.abs(moved(entropy_weight=1.0, entropy_target=0.68) - none).max() > 1e-4
+
+
 def altered(network, change):
     """The network with other parameters or another memory, which its `apply` undoes."""
 

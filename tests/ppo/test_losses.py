@@ -70,6 +70,12 @@ def test_one_failure_among_alike_samples_is_clipped_and_the_others_are_not():
     np.testing.assert_array_equal(clipped, whole.at[3].set(-4.0))
 
 
+@pytest.mark.parametrize("target, expected", [(0.3, [-1.0, 0.5, 0.6]), (1.0, [-1.0, 0.5, 1.3])])
+def test_an_entropy_counts_up_to_its_target_for_each_action(target, expected):
+    bonus = losses.bounded_entropy(jnp.array([-1.0, 0.5, 1.3]), 2, target)
+    np.testing.assert_allclose(bonus, expected, rtol=1e-6)
+
+
 def test_kl_estimate_is_unbiased_and_never_negative():
     """Two Gaussians of scale 1 whose means differ by 0.3: KL = 0.3^2 / 2."""
     x = jax.random.normal(jax.random.key(0), (200_000,))
