@@ -13,7 +13,7 @@ import pytest
 from purerl import evaluate, record, run
 from purerl.core.errors import USAGE
 from purerl.ppo import running_moments
-from purerl.ppo.networks import GaussianHead
+from purerl.ppo.networks import GaussianHead, PolicyOptions
 from purerl.report import episode_arrays
 from purerl.runs import restored_run
 
@@ -116,7 +116,7 @@ def test_a_module_that_is_applied_twice_is_noted_twice():
     class Twice(nn.Module):
         @nn.compact
         def __call__(self, x):
-            both = GaussianHead(2, "learned", 0.5)
+            both = GaussianHead(PolicyOptions(initial_std=0.5), 2)
             return both(x), both(x + 1.0)
 
     module, x = Twice(), jnp.ones(3)
