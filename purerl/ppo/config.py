@@ -38,8 +38,8 @@ class Config:
     entropy_weight: float = 0.0
     """Weight of the entropy bonus."""
     entropy_target: float = 1.0
-    """Entropy up to which there is a bonus [nats for each action]. A uniform policy has 0.69, so
-    that 1 is always; below, a policy that explores already is left to what it earns."""
+    """Entropy up to which the bonus counts [nats for each action]; 1: always, as a uniform policy
+    has 0.69. Below that, a policy that explores already follows what it earns alone."""
     max_gradient_norm: float = 1.0
     """Gradients are scaled down to this global norm."""
     learning_rate: float = 3e-4
