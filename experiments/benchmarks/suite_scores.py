@@ -42,14 +42,16 @@ class Seed(NamedTuple):
 
 def seed_of(run: RunRecord) -> Seed:
     """Returns what a run on a task scored."""
+    return Seed(run.settings["env.task"], run.seed, run.status, *evaluations(run))
+
+
+def evaluations(run: RunRecord) -> tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]:
+    """Returns steps, return and seconds since the run began, at each evaluation of a run."""
     lines = [line for line in run.lines if line.get(METRIC) is not None]
-    return Seed(
-        task=run.settings["env.task"],
-        seed=run.seed,
-        status=run.status,
-        steps=tuple(line["steps"] for line in lines),
-        returns=tuple(float(line[METRIC]) for line in lines),
-        seconds=tuple(float(line.get("wall_s") or 0.0) for line in lines),
+    return (
+        tuple(line["steps"] for line in lines),
+        tuple(float(line[METRIC]) for line in lines),
+        tuple(float(line.get("wall_s") or 0.0) for line in lines),
     )
 
 

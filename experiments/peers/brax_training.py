@@ -28,13 +28,13 @@ import jax
 import numpy as np
 
 from experiments.benchmarks.output import output_file
+from experiments.benchmarks.suite_scores import METRIC, evaluations
 from experiments.peers.brax_peer import BODIES, Published, resize, train_brax
 from purerl.core.errors import UserError
 from purerl.report import bootstrap, run_reader
 from purerl.runs.command_errors import leave
 
 NUM_EPISODES = 128
-METRIC = "eval/episode_return"
 
 
 @dataclass(frozen=True)
@@ -137,11 +137,11 @@ def read(body: str, path: str) -> list[Run]:
 
 def of_record(record: run_reader.RunRecord) -> Run:
     """Returns one of our runs; UserError if it was never evaluated."""
-    lines = [line for line in record.lines if line.get(METRIC) is not None]
-    if not lines:
+    steps, returns, seconds = map(list, evaluations(record))
+    if not returns:
         raise UserError(f"{record.path} has no {METRIC} yet; a row of the table is of evaluations.")
-    columns = ([line[name] for line in lines] for name in ("steps", "wall_s", METRIC))
-    return Run("purerl", record.settings["env.name"], record.seed, False, *columns, [])
+    body = record.settings["env.name"]
+    return Run("purerl", body, record.seed, False, steps, seconds, returns, [])
 
 
 def table(runs: Sequence[Run]) -> str:

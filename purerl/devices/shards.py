@@ -85,7 +85,7 @@ def each(function: Callable, *parts: PyTree) -> PyTree:
 def in_branch(compute: Callable, *leaves: Array) -> list[Array]:
     """Calls `compute` in a branch that is always taken; XLA does not know that it is.
 
-    So XLA compiles it by itself. A loop over time (advantages of long segments, recurrent networks)
+    So XLA compiles it by itself. A loop over time (advantages of long rollouts, recurrent networks)
     had other bits on a GPU when it was one program with the code after it, though set apart. A
     branch makes the host wait: two H200s trained 1.85 instead of 1.90 times as fast as one.
     """

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 from purerl.core.errors import UserError
 from purerl.ppo.config import Config
 from purerl.runs.files import (
-    REMOVED,
     check_is_run,
     check_object,
     read_bytes,
     read_json,
     read_metrics,
     runs_in,
+    without_removed,
 )
 from purerl.runs.loggers import MAX_SKIPPED_IN_A_ROW
 
@@ -120,6 +120,6 @@ def _flatten(value: Any, path: str = "") -> dict[str, Any]:
 
 def _planned_updates(ppo: dict[str, Any]) -> int | None:
     try:
-        return Config(**{k: v for k, v in ppo.items() if k not in REMOVED}).num_updates
+        return Config(**without_removed(ppo)).num_updates
     except (TypeError, ValueError, ArithmeticError):  # the settings of another version
         return None

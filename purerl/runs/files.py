@@ -209,6 +209,13 @@ def draft_of(path: Path) -> Path:
     return path.with_name(f".{path.name}.draft")
 
 
+def without_removed(ppo: Any) -> Any:
+    """Returns the settings of PPO in a config.json without those that the code no longer has."""
+    if not isinstance(ppo, dict):
+        return ppo
+    return {name: value for name, value in ppo.items() if name not in REMOVED}
+
+
 # --- which folders are runs, and what may stand in them ---
 
 

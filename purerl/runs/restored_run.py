@@ -10,7 +10,7 @@ from purerl.devices.programs import abstract_state
 from purerl.runs import checkpoint, checkpoint_folder, experiment, identity, manifest
 from purerl.runs.build_experiment import Setup, build, physics_hash
 from purerl.runs.experiment import Experiment, Source
-from purerl.runs.files import REMOVED, check_is_run, read_json
+from purerl.runs.files import check_is_run, read_json, without_removed
 from purerl.runs.loggers import Say
 from purerl.runs.run_folder import edited
 from purerl.runs.source_hashes import module_file, source_hashes
@@ -47,7 +47,7 @@ def restore(
     config = read_json(folder / "config.json", experiment=str, settings=dict)
     begun = manifest.read(folder)
     source = load_copy(folder, config["experiment"], Path(begun["experiment_file"]), trust)
-    known = _without_removed(config["settings"])
+    known = {k: without_removed(v) if k == "ppo" else v for k, v in config["settings"].items()}
     settings = _fill(known, experiment.to_json(source.experiment), say)
     chosen = experiment.from_json(
         source.experiment, settings | ({"engine": engine} if engine else {})
@@ -95,14 +95,6 @@ def _changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[
     if setup.engine == begun["engine"] and physics_hash(setup.env) != begun["model"]:
         found.append("MuJoCo's model")
     return found
-
-
-def _without_removed(settings: dict[str, Any]) -> dict[str, Any]:
-    """Returns a run's settings without those of training that the code no longer has."""
-    ppo = settings.get("ppo")
-    if not isinstance(ppo, dict):
-        return settings
-    return settings | {"ppo": {name: ppo[name] for name in ppo if name not in REMOVED}}
 
 
 def _fill(old: Any, new: Any, say: Say, path: str = "") -> Any:
