@@ -150,16 +150,10 @@ def table(tasks: dict[str, list[Seed]], published: dict[str, dict[str, float]]) 
 def ahead(
     tasks: dict[str, list[Seed]], published: dict[str, dict[str, float]], column: str
 ) -> tuple[list[str], list[str]]:
-    """Returns the tasks whose IQM is at or above a published column, and those that fall short.
-
-    What is published is rounded to whole numbers, so our IQM is, too: 999.7 is not below 1000.
-    """
+    """Returns the tasks whose IQM is at or above a published column, and those that fall short."""
     compared = [task for task in tasks if column in published.get(task, {})]
     scores = dict(zip(tasks, strata(tasks), strict=True))
-    reached = {
-        t: np.rint(bootstrap.interquartile_mean(scores[t])) >= published[t][column]
-        for t in compared
-    }
+    reached = {t: bootstrap.interquartile_mean(scores[t]) >= published[t][column] for t in compared}
     return [t for t in compared if reached[t]], [t for t in compared if not reached[t]]
 
 
