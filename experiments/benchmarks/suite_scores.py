@@ -14,12 +14,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from purerl.core.errors import UserError
 from purerl.report import bootstrap
 from purerl.report.run_reader import RunRecord
 
 METRIC = "eval/episode_return"
 BEST = 1000.0  # the greatest return of an episode of 1000 steps
 REFERENCES = Path(__file__).parent / "suite_reference.csv"
+COLUMNS = ("task", "seed", "status", "steps", "return", "seconds")  # of seeds.csv
 SHOWN = ("brax_ppo_10M", "brax_ppo_end", "reppo_end", "tdmpc2_4M")  # columns of the table
 LEVELS = np.linspace(0.0, BEST, 101)
 
@@ -62,7 +64,7 @@ def write_seeds(path: Path, seeds: Iterable[Seed]) -> None:
     """Writes a row for each evaluation of each seed; a seed without one has a row too."""
     with path.open("w", newline="") as file:
         rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(["task", "seed", "status", "steps", "return", "seconds"])
+        rows.writerow(COLUMNS)
         for s in seeds:
             points = list(zip(s.steps, s.returns, s.seconds, strict=True)) or [("", "", "")]
             for steps, value, seconds in points:
@@ -71,13 +73,31 @@ def write_seeds(path: Path, seeds: Iterable[Seed]) -> None:
 
 
 def read_seeds(path: Path) -> list[Seed]:
-    """Reads what `write_seeds` wrote: the table and the pictures can be made of the file alone."""
-    found: dict[tuple[str, int, str], list[tuple[int, float, float]]] = {}
+    """Reads what `write_seeds` wrote: the table and the pictures can be made of the file alone.
+
+    Raises:
+      UserError: the file lacks a column, or has words where numbers belong.
+    """
     with path.open(newline="") as file:
-        for row in csv.DictReader(file):
-            points = found.setdefault((row["task"], int(row["seed"]), row["status"]), [])
-            if row["steps"]:
-                points.append((int(row["steps"]), float(row["return"]), float(row["seconds"])))
+        rows = csv.DictReader(file)
+        if missing := [name for name in COLUMNS if name not in (rows.fieldnames or ())]:
+            raise UserError(
+                f"{path} has no column {', '.join(missing)}; a file of scores is the seeds.csv "
+                f"of this command, with the columns {', '.join(COLUMNS)}."
+            )
+        try:
+            return _seeds_of(rows)
+        except (TypeError, ValueError) as error:
+            raise UserError(f"{path}, line {rows.line_num}: {error}.") from None
+
+
+def _seeds_of(rows: Iterable[dict[str, str]]) -> list[Seed]:
+    """Returns the seeds whose evaluations `rows` are."""
+    found: dict[tuple[str, int, str], list[tuple[int, float, float]]] = {}
+    for row in rows:
+        points = found.setdefault((row["task"], int(row["seed"]), row["status"]), [])
+        if row["steps"]:
+            points.append((int(row["steps"]), float(row["return"]), float(row["seconds"])))
     return [
         Seed(*name, *(tuple(column) for column in zip(*points, strict=True)))  # type: ignore[arg-type]
         if points

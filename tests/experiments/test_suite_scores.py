@@ -8,6 +8,7 @@ import pytest
 from envs.suite.tasks import TASKS
 from experiments.benchmarks import suite_benchmark, suite_pictures, suite_scores
 from experiments.benchmarks.suite_scores import Seed
+from purerl.core.errors import UserError
 
 
 def seed(number, *returns, task="cheetah-run", status="done"):
@@ -39,6 +40,21 @@ def test_a_seed_that_failed_counts_and_one_that_is_unfinished_does_not():
 def test_what_is_written_is_read_back(tmp_path):
     suite_scores.write_seeds(tmp_path / "seeds.csv", SEEDS)
     assert sorted(suite_scores.read_seeds(tmp_path / "seeds.csv")) == sorted(SEEDS)
+
+
+def test_a_file_of_other_columns_is_named_with_what_it_lacks(tmp_path):
+    path = tmp_path / "mine.csv"
+    path.write_text("task,seed,score\ncheetah-run,1,900\n")
+    with pytest.raises(UserError, match=r"mine.csv has no column status, steps, return, seconds;"):
+        suite_benchmark.main(["--scores", str(path)])
+
+
+def test_a_word_where_a_number_belongs_is_named_with_its_line(tmp_path):
+    path = tmp_path / "mine.csv"
+    suite_scores.write_seeds(path, [seed(1, 5.0)])
+    path.write_text(path.read_text().replace(",5.00,", ",five,"))
+    with pytest.raises(UserError, match=r"mine.csv, line 2: .*five"):
+        suite_benchmark.main(["--scores", str(path)])
 
 
 def test_of_a_seed_that_two_machines_have_the_longer_counts(tmp_path):
