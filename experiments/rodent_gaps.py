@@ -11,8 +11,8 @@ H200, one seed gallops at 1.8 m/s over every gap (23.9 in 10 s, 21 at least), an
 python -m purerl.run rodent_gaps --engine warp --ppo.num-envs 4096 --ppo.rollout-length 16 \
     --ppo.num-minibatches 64 --ppo.num-steps 160000000
 
-With 30 M steps (10 min of an H100 that trained another beside it), one seed crosses 11.2 already, at
-1.0 m/s: its steps become sure while the rate falls.
+With 30 M steps (10 min of an H100 that trained another beside it), one seed crosses 11.2 already,
+at 1.0 m/s: its steps become sure while the rate falls.
 `docs/measurements/gpu.md` has their curves, and other rewards and settings over 21 M steps.
 """
 
