@@ -76,19 +76,19 @@ def read_seeds(path: Path) -> list[Seed]:
     """Reads what `write_seeds` wrote: the table and the pictures can be made of the file alone.
 
     Raises:
-      UserError: the file lacks a column, or has words where numbers belong.
+      UserError: the file is no text, lacks a column, or has words where numbers belong.
     """
+    kind = (
+        f"a file of scores is the seeds.csv of this command, with the columns {', '.join(COLUMNS)}."
+    )
     with path.open(newline="") as file:
         rows = csv.DictReader(file)
-        if missing := [name for name in COLUMNS if name not in (rows.fieldnames or ())]:
-            raise UserError(
-                f"{path} has no column {', '.join(missing)}; a file of scores is the seeds.csv "
-                f"of this command, with the columns {', '.join(COLUMNS)}."
-            )
         try:
+            if missing := [name for name in COLUMNS if name not in (rows.fieldnames or ())]:
+                raise UserError(f"{path} has no column {', '.join(missing)}; {kind}")
             return _seeds_of(rows)
-        except (TypeError, ValueError) as error:
-            raise UserError(f"{path}, line {rows.line_num}: {error}.") from None
+        except (TypeError, ValueError) as error:  # TypeError: a line that ends early
+            raise UserError(f"{path}, line {rows.line_num}: {error}; {kind}") from None
 
 
 def _seeds_of(rows: Iterable[dict[str, str]]) -> list[Seed]:

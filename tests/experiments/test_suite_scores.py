@@ -57,6 +57,18 @@ def test_a_word_where_a_number_belongs_is_named_with_its_line(tmp_path):
         suite_benchmark.main(["--scores", str(path)])
 
 
+@pytest.mark.parametrize(
+    "content", [b"\x89PNG\r\n", b"task,seed,status,steps,return,seconds\na,1,done,9\n"]
+)
+def test_a_file_that_is_no_table_or_ends_early_is_named(tmp_path, content):
+    path = tmp_path / "mine.csv"
+    path.write_bytes(content)
+    with pytest.raises(
+        UserError, match=r"mine.csv, line \d: .*; a file of scores is the seeds.csv"
+    ):
+        suite_benchmark.main(["--scores", str(path)])
+
+
 def test_of_a_seed_that_two_machines_have_the_longer_counts(tmp_path):
     short, long = seed(1, 5.0, status="unfinished"), seed(1, 5.0, 7.0)
     other = seed(2, 1.0)
