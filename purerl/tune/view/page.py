@@ -26,6 +26,7 @@ PLOTS = {
     "Value": readouts.value_plot,
     "Actions": readouts.action_plot,
 }
+AS_IN_FILE = "# as in the experiment's file"  # as high as the overrides of one slider
 PLOT_HEIGHT, PANEL_WIDTH = 190, 380  # [pixels]
 
 
@@ -71,7 +72,6 @@ class Page:
           checkpoints: names to choose among, the first being in use; none: nothing to choose.
         """
         gui, put = self.server.gui, self.events.put
-        self.status, self.trouble = gui.add_markdown("opening"), gui.add_markdown("")
         self.play = gui.add_button("Pause")
         self.play.on_click(lambda _: put(events.Play(self.play.label == "Play")))
         moves = gui.add_button_group("Move on", tuple(MOVES))
@@ -137,7 +137,9 @@ class Page:
     def _add_plots(self) -> None:
         panel = self.server.gui.add_panel()
         self.tab = panel.add_tab("Live")
-        with self.tab:
+        with self.tab:  # whatever grows is here, so that no button moves under the mouse
+            self.status = self.server.gui.add_markdown("opening")
+            self.trouble = self.server.gui.add_markdown("")
             self.table = self.server.gui.add_html("")
         self.server.gui.main_panel.dock_right()
         panel.dock_left()
@@ -175,7 +177,7 @@ class Page:
         _show(self.status, "  \n".join(readouts.status_lines(session, doing)))
         _show(self.trouble, f"**{session.trouble}**" if session.trouble else "")
         if self.sliders:
-            _show(self.words, f"```\n{words}\n```" if words else "As in the experiment's file.")
+            _show(self.words, f"```\n{words or AS_IN_FILE}\n```")
         _show(self.table, readouts.reward_table(session))
         self._draw_plots(session)
 

@@ -87,6 +87,7 @@ def status_lines(session: Session, pace: str) -> list[str]:
     return [
         f"{session.checkpoint}, seed {session.seed}, episode {session.episode}",
         f"{session.length * timestep:.2f} s, step {session.length}, "
-        f"return {session.sums.get('reward', 0.0):.4g} ({doing})",
+        f"return {session.sums.get('reward', 0.0):.4g}",
+        doing,
         *([session.ended] if session.ended else []),
     ]

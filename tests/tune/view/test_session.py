@@ -217,5 +217,6 @@ def test_the_state_is_told_in_lines():
     session = s.advance(opened(3), [s.Tick(0.1)])
     lines = readouts.status_lines(session, "1.00 x real time")
     assert lines[0] == "first, seed 3, episode 1"
-    assert lines[1] == "0.04 s, step 2, return 4 (1.00 x real time)"
-    assert lines[2] == session.ended
+    assert lines[1] == "0.04 s, step 2, return 4"
+    assert lines[2] == "1.00 x real time"
+    assert lines[3] == session.ended

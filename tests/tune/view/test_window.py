@@ -222,6 +222,20 @@ class Window:
         self._mark(f"e.textContent == {json.dumps(words)}", "button")
         self.browser.click("#marked")
 
+    def place(self, find: str, kind: str) -> float:
+        """How far an element is below the top of its panel [pixels]."""
+        self._mark(find, kind)
+        return self.browser.value(
+            """(() => { const e = document.querySelector('#marked');
+            const top = (x) => x.getBoundingClientRect().top;
+            return top(e) - top(e.closest('[class*=ScrollArea-content]')) })()"""
+        )
+
+    def places(self) -> tuple[float, float]:
+        """Where the button that plays is, and the first slider."""
+        button = self.place("['Play', 'Pause'].includes(e.textContent)", "button")
+        return button, self.place(_below("bonus", range(5, 9)), "[role=slider]")
+
     def tick(self, label: str) -> None:
         self._mark(_below(label, range(1, 9)), "input[type=checkbox]")
         self.browser.click("#marked")
@@ -264,6 +278,7 @@ class Window:
 def play(window: Window, tmp_path: Path) -> None:
     """What a person does; each thing is seen before the next."""
     assert "of update 3 (96 steps)" in window.text()
+    places = window.places()
     # It moves, until it is told not to, and then step by step.
     steps = window.steps()
     window.wait(lambda: window.steps() > steps)
@@ -276,6 +291,7 @@ def play(window: Window, tmp_path: Path) -> None:
     assert window.row("bonus")[0] == 1.0
     window.press("bonus", "End")
     window.wait(lambda: "--env.bonus 4.0" in window.text())
+    assert window.places() == places  # they stay under the mouse
     window.click("Step")
     window.wait(lambda: window.row("bonus")[0] == 4.0)
     window.click("Train this")
@@ -304,6 +320,8 @@ def play(window: Window, tmp_path: Path) -> None:
     # An environment that ends at once.
     window.press("limit", "Home")
     window.wait(lambda: "ends at its first step" in window.text())
+    # Whatever the page has said, and it has said more and more, the button is where it was.
+    assert window.places()[0] == places[0]
 
 
 @pytest.mark.slow
