@@ -32,6 +32,7 @@ import jax.numpy as jnp
 from experiments.benchmarks import start_up
 from experiments.benchmarks.output import output_file
 from purerl import exact
+from purerl.core.parts import WHOLE
 from purerl.core.records import Array, Network, PyTree, TrainState
 from purerl.physics.lookup import scale_action
 from purerl.ppo import algorithm, learner
@@ -126,7 +127,8 @@ def learn(
     config: algorithm.Config, network: Network, state: TrainState, seen: algorithm.Experience
 ) -> tuple[TrainState, PyTree]:
     """The learner alone, on one rollout's experience."""
-    return learner.learn(config, network, state, seen.batch, seen.memory)
+    first = seen.number[:, 0]
+    return learner.learn(config, network, state, seen.batch, seen.memory, first, WHOLE)
 
 
 def compile_part(name: str, function: Callable, arguments: tuple, steps: int | None) -> Part:

@@ -16,14 +16,29 @@ from purerl.core.errors import UserError
 from purerl.runs.experiment import find
 
 
+def experiment():
+    """cartpole_swingup of 4 environments and 2 steps."""
+    chosen = find("cartpole_swingup")
+    config = dataclasses.replace(
+        chosen.ppo, num_envs=4, rollout_length=2, num_minibatches=1, episode_length=5
+    )
+    return dataclasses.replace(chosen, ppo=config)
+
+
 @pytest.fixture(scope="module")
 def small():
-    """cartpole_swingup of 4 environments and 2 steps: physics and update, compiled."""
-    chosen = find("cartpole_swingup")
-    config = dataclasses.replace(chosen.ppo, num_envs=4, rollout_length=2, num_minibatches=1)
-    return benchmark.make_bench(
-        dataclasses.replace(chosen, ppo=config), ("physics alone", "update")
-    )
+    """Its physics and update, compiled."""
+    return benchmark.make_bench(experiment(), ("physics alone", "update"))
+
+
+@pytest.mark.slow
+def test_every_part_is_run():
+    bench = benchmark.make_bench(experiment())
+    assert tuple(part.name for part in bench.parts) == benchmark.PARTS
+    learned, _ = bench.parts[2].call()
+    weights = [jax.tree.leaves(state.params)[0] for state in (bench.state, learned)]
+    assert (np.asarray(weights[0]) != np.asarray(weights[1])).any()
+    assert all(t.steps_per_second > 0 for t in benchmark.measure(bench.parts, 1, 0.0))
 
 
 @pytest.mark.slow
