@@ -158,7 +158,7 @@ def round_ellipsoids(model: mujoco.MjModel) -> None:
     """
     for i in np.flatnonzero(model.geom_type == _GEOM.mjGEOM_ELLIPSOID):
         if model.geom_contype[i] or model.geom_conaffinity[i]:
-            _make_capsule(model, i)
+            _make_capsule(model, int(i))
 
 
 # Rotations that turn z, a capsule's axis, onto x, y, z.

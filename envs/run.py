@@ -123,7 +123,7 @@ class Run:
         rest = jnp.asarray(model.qpos0, jnp.float32)
         # Unique: a sum of terms that might meet would have no fixed order on a GPU.
         qpos = rest.at[jnp.array(self.joints)].add(limbs, unique_indices=True)
-        task = {"factors": draw_factors(model_key, self.options.randomization)}
+        task: dict[str, Any] = {"factors": draw_factors(model_key, self.options.randomization)}
         if isinstance(self.parts.arena, GapsCorridor):
             task["course"] = draw_course(course_key, self.parts.arena)
             task["crossed"] = jnp.zeros((), jnp.int32)
@@ -153,7 +153,7 @@ class Run:
 
     def _changes(self, task: dict[str, Any], x: Array) -> dict[str, Array]:
         changes = randomized_fields(self.physics.model, self.options.randomization, task["factors"])
-        if "course" in task:
+        if isinstance(self.parts.arena, GapsCorridor):
             reach = self.parts.body.reach
             changes |= course_changes(self.parts.boxes, task["course"], x, reach)
         return changes
@@ -173,7 +173,7 @@ class Run:
         metrics |= overflow_metric(readings)
         task = task | {"center": center}
         finished = jnp.zeros((), bool)
-        if "course" in task:
+        if isinstance(self.parts.arena, GapsCorridor):
             # Beyond the end there is no ground; having run all of the corridor is no failure.
             finished = healthy & (physics.qpos[0] >= self.parts.arena.length)
             crossed = jnp.maximum(gaps_crossed(task["course"], physics.qpos[0]), task["crossed"])
@@ -185,7 +185,7 @@ class Run:
         return State(
             physics=physics,
             observation=self._observe(physics, readings, task, action),
-            reward=sum(terms.values()),
+            reward=sum(terms.values(), jnp.zeros(())),
             terminated=~healthy,
             truncated=finished,
             metrics=metrics,
@@ -213,7 +213,7 @@ class Run:
             parts.append(physics.qpos[:2])
         if self.options.observe_bodies:
             parts += [readings.cinert[1:].ravel(), readings.cvel[1:].ravel()]
-        if "course" in task:
+        if isinstance(self.parts.arena, GapsCorridor):
             sight = self.parts.body.sight
             edges = distances_to_next_edges(task["course"], physics.qpos[0], 6, sight)
             parts += [physics.qpos[1:2], edges]

@@ -27,7 +27,7 @@ class Acrobot:
     """The domain; `build` makes an environment of it."""
 
     margin: float  # [m]
-    arms: tuple[int, int]  # bodies, upper and lower
+    arms: tuple[int, ...]  # bodies, upper and lower
     tip: int  # site
     target: int  # site
     radius: float  # of the target [m]

@@ -103,7 +103,7 @@ class SuiteEnv:
         )
 
 
-def load_model(physics: type, xml: tuple[str, dict[str, bytes]], engine: str) -> mujoco.MjModel:
+def load_model(physics: Any, xml: tuple[str, dict[str, bytes]], engine: str) -> mujoco.MjModel:
     """Compiles a domain's own MJCF, given its dm_control Physics class, XML and assets."""
     model = physics.from_xml_string(*xml).model.ptr
     disable_energy(model)
@@ -184,7 +184,7 @@ def random_joints(model: mujoco.MjModel, key: Array) -> Array:
 
 
 def draw_apart(
-    draw: Callable[[Array], Array], geoms: Physics, pairs: Array, key: Array, candidates: int
+    draw: Callable[[Array], Array], geoms: Physics, pairs: np.ndarray, key: Array, candidates: int
 ) -> Array:
     """Draws a qpos in which nothing touches: the first such of several candidates.
 

@@ -47,8 +47,8 @@ class Manipulator:
     geoms: Physics  # to see what touches at the start, and where the hand is
     arm: tuple[int, ...]  # arm's and hand's joints in qpos, and in qvel
     ball: tuple[int, ...]  # its joints in qpos, and in qvel
-    bodies: tuple[int, int, int]  # hand, ball, target
-    sites: tuple[int, int, int]  # grasp, ball, target
+    bodies: tuple[int, ...]  # hand, ball, target
+    sites: tuple[int, ...]  # grasp, ball, target
     ball_geom: int
     touch: tuple[int, ...]  # in sensordata
 

@@ -81,7 +81,7 @@ def bare_physics(env: Any, config: algorithm.Config, state: TrainState, key: Arr
     def step(physics: PyTree, t: Array) -> tuple[PyTree, None]:
         action = jax.random.uniform(jax.random.fold_in(key, t), size, minval=-1.0, maxval=1.0)
         ctrl = jax.vmap(partial(scale_action, env.physics.model))(action)
-        changes = getattr(env, "model_changes", lambda _: {})
+        changes: Callable = getattr(env, "model_changes", lambda _: {})
         changed = jax.vmap(changes)(state.env)
         following, _ = jax.vmap(env.physics.step)(physics, ctrl, changed)
         # One that blows up starts again, so that all are worth their time.
@@ -137,7 +137,8 @@ def compile_part(name: str, function: Callable, arguments: tuple, steps: int | N
     compiled = jax.jit(function).lower(*arguments).compile()
     seconds = time.perf_counter() - start
     jax.block_until_ready(compiled(*arguments))
-    temporary = compiled.memory_analysis().temp_size_in_bytes
+    analysis = compiled.memory_analysis()  # None where XLA tells nothing
+    temporary = analysis.temp_size_in_bytes if analysis else 0
     return Part(name, lambda: compiled(*arguments), steps, seconds, temporary)
 
 

@@ -22,6 +22,7 @@ from purerl.runs import build_experiment
 from purerl.runs.check_env import check_env
 from purerl.runs.command_errors import leave
 from purerl.runs.experiment import Experiment, find
+from purerl.runs.options import Engine
 
 OURS = ("cartpole_swingup", "ant_run", "ant_gaps", "rodent_run", "rodent_gaps")
 ROW = "| {:24} | {:6} | {:8} | {:>13} | {:>9} | {:>5} |"
@@ -34,7 +35,7 @@ def all_experiments() -> dict[str, Experiment]:
     return {name: find(name) for name in OURS} | of_suite
 
 
-def sized(experiment: Experiment, engine: str, num_envs: int, length: int) -> Experiment:
+def sized(experiment: Experiment, engine: Engine, num_envs: int, length: int) -> Experiment:
     """Returns the experiment on an engine, with B environments, T steps a rollout; 0: its own."""
     num_envs, length = num_envs or experiment.ppo.num_envs, length or experiment.ppo.rollout_length
     steps = num_envs * length
@@ -44,7 +45,7 @@ def sized(experiment: Experiment, engine: str, num_envs: int, length: int) -> Ex
     return dataclasses.replace(experiment, engine=engine, ppo=config)
 
 
-def row(name: str, experiment: Experiment, engine: str, rounds: int) -> str:
+def row(name: str, experiment: Experiment, engine: Engine, rounds: int) -> str:
     """Checks and times one environment on one engine."""
     config, env, network, _ = build_experiment.build(experiment)
     check_env(env, num_envs=2, num_steps=2)

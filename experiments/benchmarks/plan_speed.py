@@ -30,8 +30,10 @@ from purerl.runs.experiment import available
 from purerl.tune.plan import planner
 from purerl.tune.plan.settings import Settings
 
-BODIES = ("cartpole-swingup", "cheetah-run", "walker-walk", "hopper-hop", "humanoid-stand")
-BODIES += ("ant_run", "ant_gaps", "rodent_run", "rodent_gaps")
+BODIES = (
+    "cartpole-swingup", "cheetah-run", "walker-walk", "hopper-hop", "humanoid-stand", "ant_run",
+    "ant_gaps", "rodent_run", "rodent_gaps",
+)  # fmt: skip
 WARM = 5  # control steps before the ones that are timed
 
 
@@ -57,7 +59,8 @@ class Recorder:
 
     def __init__(self) -> None:
         """Begins with nothing."""
-        self.on, self.asked = False, []
+        self.on = False
+        self.asked: list[Any] = []
         self.load, self.advance = engine_c._load, engine_c._advance
 
     def loading(self, targets: Any, rows: np.ndarray, bad: np.ndarray, model: Any) -> None:

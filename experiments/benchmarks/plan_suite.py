@@ -38,7 +38,7 @@ from purerl.tune.plan.settings import NO_SEARCH, Settings
 MUST_SHOW = ("cartpole-swingup", "walker-walk", "cheetah-run", "hopper-hop", "humanoid-stand")
 # The cart hits its end 2 s after what set it on its way there; the control step is 10 ms.
 # A lying hopper earns 0 whatever it does, until a wild movement has thrown it up.
-OTHER_SETTINGS = {
+OTHER_SETTINGS: dict[str, dict[str, Any]] = {
     "cartpole-swingup": {"samples": 32, "horizon": 150},
     "hopper-hop": {"noise": 1.0},
 }

@@ -34,6 +34,7 @@ from purerl.runs import build_experiment
 from purerl.runs.command_errors import leave
 from purerl.runs.command_line import from_command_line
 from purerl.runs.experiment import Experiment, find_source
+from purerl.runs.options import Engine
 
 HERE = sorted(os.sched_getaffinity(0))  # cores that this process may use
 AXES: dict[str, tuple[int, ...]] = {
@@ -43,8 +44,10 @@ AXES: dict[str, tuple[int, ...]] = {
     "cores": tuple(2**i for i in range(len(HERE).bit_length())),
     "seeds": (1, 2, 4, 8),
 }
-FIELDS = ("axis", "value", "steps_per_s", "physics_steps_per_s", "share", "compile_s")
-FIELDS += ("state_mb", "update_mb", "process_mb")
+FIELDS = (
+    "axis", "value", "steps_per_s", "physics_steps_per_s", "share", "compile_s", "state_mb",
+    "update_mb", "process_mb",
+)  # fmt: skip
 SHORT = 8  # steps of a rollout over environments: 16,384 of them take long enough
 
 
@@ -115,7 +118,7 @@ def run_on(cores: int, command: list[str]) -> int:
         os.sched_setaffinity(0, HERE)
 
 
-def seeds_point(experiment: Experiment, engine: str, number: int) -> dict[str, Any]:
+def seeds_point(experiment: Experiment, engine: Engine, number: int) -> dict[str, Any]:
     """Measures the update of vmapped seeds."""
     chosen = dataclasses.replace(experiment, engine=engine)
     config, env, network, _ = build_experiment.build(chosen)

@@ -66,10 +66,11 @@ def write_seeds(path: Path, seeds: Iterable[Seed]) -> None:
         rows = csv.writer(file, lineterminator="\n")
         rows.writerow(COLUMNS)
         for s in seeds:
-            points = list(zip(s.steps, s.returns, s.seconds, strict=True)) or [("", "", "")]
-            for steps, value, seconds in points:
-                known = [f"{value:.2f}", f"{seconds:.1f}"] if steps != "" else ["", ""]
-                rows.writerow([s.task, s.seed, s.status, steps, *known])
+            name = s.task, s.seed, s.status
+            if not s.steps:
+                rows.writerow([*name, "", "", ""])
+            for steps, value, seconds in zip(s.steps, s.returns, s.seconds, strict=True):
+                rows.writerow([*name, steps, f"{value:.2f}", f"{seconds:.1f}"])
 
 
 def read_seeds(path: Path) -> list[Seed]:
@@ -99,7 +100,7 @@ def _seeds_of(rows: Iterable[dict[str, str]]) -> list[Seed]:
         if row["steps"]:
             points.append((int(row["steps"]), float(row["return"]), float(row["seconds"])))
     return [
-        Seed(*name, *(tuple(column) for column in zip(*points, strict=True)))  # type: ignore[arg-type]
+        Seed(*name, *(tuple(column) for column in zip(*points, strict=True)))
         if points
         else Seed(*name, (), (), ())
         for name, points in found.items()

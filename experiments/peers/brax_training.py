@@ -141,7 +141,8 @@ def of_record(record: run_reader.RunRecord) -> Run:
     if not returns:
         raise UserError(f"{record.path} has no {METRIC} yet; a row of the table is of evaluations.")
     body = record.settings["env.name"]
-    return Run("purerl", body, record.seed, False, steps, seconds, returns, [])
+    counts = [int(count) for count in steps]
+    return Run("purerl", body, record.seed, False, counts, seconds, returns, [])
 
 
 def table(runs: Sequence[Run]) -> str:

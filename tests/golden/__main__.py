@@ -82,10 +82,13 @@ def compute(names: list[str]) -> dict[str, dict[str, str]]:
 def main() -> int:
     """Runs the command."""
     parser = argparse.ArgumentParser(prog="python -m tests.golden", description=__doc__)
-    parser.add_argument("names", nargs="*", help=", ".join([*RUNS, "statistics"]))
+    every = [*RUNS, "statistics"]
+    parser.add_argument("names", nargs="*", help=", ".join(every))
     parser.add_argument("--write", action="store_true", help="put them into digests.json")
     given = parser.parse_args()
-    found = compute(given.names or [*RUNS, "statistics"])
+    if unknown := [name for name in given.names if name not in every]:
+        parser.error(f"{unknown[0]} is not one of {', '.join(every)}.")
+    found = compute(given.names or every)
     known = json.loads(TABLE.read_text()) if TABLE.exists() else {}
     parted = [name for name, one in found.items() if known.get(name) != one]
     for name, one in found.items():
