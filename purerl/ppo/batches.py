@@ -9,6 +9,7 @@ from purerl.core.records import Array, PyTree, TrainState
 from purerl.ppo import running_moments
 from purerl.ppo.advantages import gae
 from purerl.ppo.config import Config
+from purerl.ppo.noise import Prediction
 from purerl.ppo.rollout import Transition
 
 
@@ -17,7 +18,8 @@ class Batch(NamedTuple):
 
     observation: PyTree  # [..., O] normalized
     raw_action: Array  # [..., A]
-    log_prob: Array  # [...] under the policy that acted
+    prediction: Prediction | None  # of its noise; None: white
+    log_prob: Array  # [...] under the policy that acted, given the prediction
     old_value: Array  # [...]
     advantage: Array  # [...]
     target: Array  # [...] of the value
@@ -63,6 +65,7 @@ def make_batch(
     return Batch(
         observation=running_moments.normalize(state.normalizer, transitions.observation),
         raw_action=transitions.raw_action,
+        prediction=transitions.prediction,
         log_prob=transitions.log_prob,
         old_value=transitions.value,
         advantage=advantage,

@@ -17,6 +17,7 @@ TRAINING = (
     ("above 0, and finite", lambda x: 0.0 < x < math.inf, "clip max_gradient_norm"),
     ("0 or above", lambda x: 0.0 <= x < math.inf, "value_weight entropy_weight"),
     ("0 or above", lambda x: 0.0 <= x < math.inf, "shortest_episode advantage_clip"),
+    ("in [0, 2]", lambda x: 0.0 <= x <= 2.0, "noise_color"),
     ("finite", math.isfinite, "entropy_target"),
 )
 EVALUATION = (

@@ -13,6 +13,7 @@ from purerl.core.records import Array, Metrics, Network, PolicyOutput, PyTree, T
 from purerl.ppo import distributions, losses
 from purerl.ppo.batches import Batch, in_one_row
 from purerl.ppo.config import Config
+from purerl.ppo.noise import given
 from purerl.ppo.optimizer import next_rate, optimizer, scheduled_rate
 from purerl.ppo.rollout import select
 from purerl.ppo.running_moments import Moments, moments, pool
@@ -147,7 +148,8 @@ def loss(
     is the minibatch's loss.
     """
     output = unroll(network, params, batch, memory)
-    log_prob = distributions.log_prob(output.distribution, batch.raw_action)
+    distribution = given(output.distribution, batch.prediction)
+    log_prob = distributions.log_prob(distribution, batch.raw_action)
     log_ratio = log_prob - batch.log_prob
     advantage = losses.normalize_advantage(batch.advantage, scale, config.advantage_clip)
     terms = {

@@ -22,6 +22,7 @@ from purerl.core.records import (
 )
 from purerl.ppo import distributions, running_moments
 from purerl.ppo.config import Config
+from purerl.ppo.noise import Prediction, action_noise, given
 
 
 class Transition(NamedTuple):
@@ -29,7 +30,8 @@ class Transition(NamedTuple):
 
     observation: PyTree  # [..., O] before the step
     raw_action: Array  # [..., A] before squashing
-    log_prob: Array  # [...] of the raw action, under the policy that acted
+    prediction: Prediction | None  # of its noise; None: white
+    log_prob: Array  # [...] of the raw action, under the policy that acted, given the prediction
     value: Array  # [...] V(s_t)
     reward: Array  # [...] unscaled
     discounted_return: Array  # [...] running, for reward scaling
@@ -166,11 +168,10 @@ def rollout(
     reset_keys = per_environment(derive(state.key, Purpose.RESET, state.update), state.number)
     # One start for an update, its number 0; without the fold all digests would be others.
     fresh = jax.vmap(lambda key: env.reset(jax.random.fold_in(key, 0)))(reset_keys)
-    action_key = derive(state.key, Purpose.ACTION, state.update)
+    noise = action_noise(config, state, env.action_size)
 
     def step(carry: Carry, t: Array) -> tuple[Carry, Transition]:
-        keys = per_environment(jax.random.fold_in(action_key, t), state.number)
-        return _step(config, env, network, state, fresh, carry, keys)
+        return _step(config, env, network, state, fresh, carry, *noise(t))
 
     never = jnp.zeros(state.number.shape, bool)
     nothing = episode_sums(state.episode, never, never)
@@ -190,12 +191,13 @@ def _step(
     state: TrainState,
     fresh: State,
     carry: Carry,
-    keys: Array,
+    white: Array,
+    prediction: Prediction | None,
 ) -> tuple[Carry, Transition]:
-    """Acts once in every environment, with noise from `keys` [B]; `fresh` replaces what ended."""
+    """Acts once in every environment, with noise of `white` [B, A]; `fresh` replaces what ended."""
     output, memory = act(network, state, carry.env, carry.memory)
-    noise = jax.vmap(lambda key: jax.random.normal(key, (env.action_size,)))(keys)
-    raw = distributions.sample(output.distribution, noise)
+    distribution = given(output.distribution, prediction)
+    raw = distributions.sample(distribution, white)
     action = distributions.to_action(raw)
     env_state, episode = step_episodes(env, carry.env, carry.episode, action)
 
@@ -206,12 +208,13 @@ def _step(
     reward = jnp.where(lost, 0.0, env_state.reward)
     discounted_return = config.gamma * carry.discounted_return + reward
     # A fresh start may itself be NaN, and 0 times NaN is no 0.
-    log_prob = distributions.log_prob(output.distribution, raw)
+    log_prob = distributions.log_prob(distribution, raw)
     seen = carry.env.observation, raw, log_prob, output.value
     observation, raw, log_prob, value = select(lost, jax.tree.map(jnp.zeros_like, seen), seen)
     transition = Transition(
         observation=observation,
         raw_action=raw,
+        prediction=prediction,
         log_prob=log_prob,
         value=value,
         reward=reward,

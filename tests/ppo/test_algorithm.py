@@ -89,9 +89,12 @@ def learn(config, network, state, batch, memory):
 
 
 @pytest.mark.parametrize("recurrent", [False, True])
-def test_the_first_ratio_is_one(recurrent):
+@pytest.mark.parametrize("color", [0.0, 1.0])
+def test_the_first_ratio_is_one(recurrent, color):
     """Before any gradient step, the learner computes the very log-probability that acted."""
-    config = dataclasses.replace(CONFIG, num_epochs=1, num_minibatches=1, num_envs=6)
+    config = dataclasses.replace(
+        CONFIG, num_epochs=1, num_minibatches=1, num_envs=6, noise_color=color
+    )
     env, network, state = setup(config, recurrent=recurrent)
     _, metrics = UPDATE(config, env, network, state)
     assert abs(metrics["kl"]) < 1e-10
