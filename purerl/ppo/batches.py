@@ -5,11 +5,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from purerl.core.records import Array, PyTree, TrainState
+from purerl.core.records import Array, Normal, PyTree, TrainState
 from purerl.ppo import running_moments
 from purerl.ppo.advantages import gae
 from purerl.ppo.config import Config
-from purerl.ppo.noise import Prediction
 from purerl.ppo.rollout import Transition
 
 
@@ -18,8 +17,8 @@ class Batch(NamedTuple):
 
     observation: PyTree  # [..., O] normalized
     raw_action: Array  # [..., A]
-    prediction: Prediction | None  # of its noise; None: white
-    log_prob: Array  # [...] under the policy that acted, given the prediction
+    noise: Normal | None  # [..., A] of the action, given that before; None: white
+    log_prob: Array  # [...] under the policy that acted and such noise
     old_value: Array  # [...]
     advantage: Array  # [...]
     target: Array  # [...] of the value
@@ -65,7 +64,7 @@ def make_batch(
     return Batch(
         observation=running_moments.normalize(state.normalizer, transitions.observation),
         raw_action=transitions.raw_action,
-        prediction=transitions.prediction,
+        noise=transitions.noise,
         log_prob=transitions.log_prob,
         old_value=transitions.value,
         advantage=advantage,

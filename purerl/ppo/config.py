@@ -34,8 +34,7 @@ class Config:
     advantage_clip: float = 0.0
     """Range of the normalized advantage, +- so many standard deviations; 0: any."""
     noise_color: float = 0.0
-    """Exponent b of the action noise, whose power in a rollout is 1 / f^b; 0: white. Colored noise
-    pushes one way for several steps, and so finds what takes a swing."""
+    """Exponent b of the action noise, of power 1 / f^b: 0 white, 1 pink, whose pushes last."""
     value_weight: float = 0.5
     """Weight of the value loss."""
     entropy_weight: float = 0.0

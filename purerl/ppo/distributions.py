@@ -23,6 +23,13 @@ def sample(parameters: Normal, noise: Array) -> Array:
     return parameters.loc + parameters.scale * noise
 
 
+def given(parameters: Normal, noise: Normal | None) -> Normal:
+    """Returns the Gaussian of raw actions whose noise has the Gaussian `noise` [..., A]."""
+    if noise is None:
+        return parameters
+    return Normal(parameters.loc + parameters.scale * noise.loc, parameters.scale * noise.scale)
+
+
 def to_action(raw: Array) -> Array:
     """Returns the action tanh(raw), in [-1, 1], same shape."""
     return jnp.tanh(raw)

@@ -10,6 +10,7 @@ from purerl.core.keys import per_environment
 from purerl.core.records import Array, EpisodeStats, Metrics, Network, PyTree, TrainState
 from purerl.ppo import distributions, rollout
 from purerl.ppo.config import Config
+from purerl.ppo.noise import white
 
 
 class Progress(NamedTuple):
@@ -49,8 +50,7 @@ def evaluate(
         raw = output.distribution.loc
         if not deterministic:
             step_key = jax.random.fold_in(action_key, progress.t)
-            keys = per_environment(step_key, jnp.arange(num_episodes))
-            noise = jax.vmap(lambda key: jax.random.normal(key, (env.action_size,)))(keys)
+            noise = white(step_key, jnp.arange(num_episodes), env.action_size)
             raw = distributions.sample(output.distribution, noise)
         return advance(env, progress, distributions.to_action(raw), memory)
 
@@ -70,14 +70,9 @@ def start(
     fresh = jax.vmap(env.reset)(per_environment(reset_key, jnp.arange(num_episodes)))
     limit = jnp.full(num_episodes, config.episode_length, jnp.int32)
     never = jnp.zeros(num_episodes, bool)
-    return Progress(
-        t=jnp.zeros((), jnp.int32),
-        env=fresh,
-        memory=rollout.start_memory(state.carry, num_episodes),
-        episode=rollout.start_episodes(fresh, limit),
-        over=never,
-        lost=never,
-    )
+    memory = rollout.start_memory(state.carry, num_episodes)
+    episode, t = rollout.start_episodes(fresh, limit), jnp.zeros((), jnp.int32)
+    return Progress(t, fresh, memory, episode, over=never, lost=never)
 
 
 def advance(env: Env, progress: Progress, action: Array, memory: PyTree) -> Progress:

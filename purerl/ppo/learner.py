@@ -1,6 +1,5 @@
 """The learner: E epochs of K minibatch steps on what an update has collected (PPO, section 5)."""
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -13,7 +12,6 @@ from purerl.core.records import Array, Metrics, Network, PolicyOutput, PyTree, T
 from purerl.ppo import distributions, losses
 from purerl.ppo.batches import Batch, in_one_row
 from purerl.ppo.config import Config
-from purerl.ppo.noise import given
 from purerl.ppo.optimizer import next_rate, optimizer, scheduled_rate
 from purerl.ppo.rollout import select
 from purerl.ppo.running_moments import Moments, moments, pool
@@ -47,7 +45,8 @@ def learn(
     Each part shuffles its own samples of a rollout, [V, T, B, ...], by the number of its `first`
     environment [V], and has an equal share of every minibatch. `memory` [V, B, H] opens it.
     """
-    batch = jax.vmap(functools.partial(arrange, is_recurrent(memory)))(batch)
+    if not is_recurrent(memory):  # then what is shuffled are single samples, else whole rollouts
+        batch = jax.vmap(in_one_row)(batch)
     columns = batch.weight.shape[-1]
     rate = scheduled_rate(config, state)
     learner = Learner(state.params, state.optimizer, rate, state.skipped_in_a_row)
@@ -75,14 +74,6 @@ def learn(
         ),
     }
     return state.replace(**learner._asdict()), metrics
-
-
-def arrange(recurrent: bool, batch: Batch) -> Batch:
-    """Lays one part's rollout [T, B] out in columns, of which minibatches take some.
-
-    Columns are whole rollouts of a network with memory, or single samples.
-    """
-    return batch if recurrent else in_one_row(batch)
 
 
 def take_columns(batch: Batch, memory: PyTree, index: Array) -> tuple[Batch, PyTree]:
@@ -148,7 +139,7 @@ def loss(
     is the minibatch's loss.
     """
     output = unroll(network, params, batch, memory)
-    distribution = given(output.distribution, batch.prediction)
+    distribution = distributions.given(output.distribution, batch.noise)
     log_prob = distributions.log_prob(distribution, batch.raw_action)
     log_ratio = log_prob - batch.log_prob
     advantage = losses.normalize_advantage(batch.advantage, scale, config.advantage_clip)
@@ -203,11 +194,8 @@ def minibatch_step(
         (stepped, optimizer_state),
         (learner.params, learner.optimizer),
     )
-    learner = Learner(
-        params=params,
-        optimizer=optimizer_state,
-        learning_rate=next_rate(config, learner.learning_rate, metrics["kl"], sound),
-        skipped_in_a_row=jnp.where(sound, 0, learner.skipped_in_a_row + 1),
-    )
+    rate = next_rate(config, learner.learning_rate, metrics["kl"], sound)
+    in_a_row = jnp.where(sound, 0, learner.skipped_in_a_row + 1)
+    learner = Learner(params, optimizer_state, rate, in_a_row)
     skipped = 1.0 - sound.astype(jnp.float32)
     return learner, metrics | {"loss": objective, "gradient_norm": norm, "skipped": skipped}

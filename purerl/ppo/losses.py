@@ -36,8 +36,8 @@ def value_loss(value: Array, target: Array) -> Array:
 
 def bounded_entropy(entropy: Array, action_size: int, target: float) -> Array:
     """Returns the entropy [nats], where it is at most `target` for each action, elementwise."""
-    uniform = math.log(2.0)  # of actions in [-1, 1]: the greatest
-    return jnp.minimum(entropy, target * action_size) if target < uniform else entropy
+    greatest = target >= math.log(2.0)  # that of uniform actions in [-1, 1]
+    return entropy if greatest else jnp.minimum(entropy, target * action_size)
 
 
 def approximate_kl(log_ratio: Array) -> Array:
@@ -49,14 +49,7 @@ def approximate_kl(log_ratio: Array) -> Array:
 
 
 def explained_variance(value: Array, target: Array, weight: Array, parts: Parts) -> Array:
-    """Returns 1 - Var(target - value) / Var(target), []: 1 is perfect, 0 no better than a mean.
-
-    Args:
-      value: [V, ...].
-      target: [V, ...].
-      weight: [V, ...].
-      parts: how the V parts are computed.
-    """
+    """Returns 1 - Var(target - value) / Var(target), [], of V parts [V, ...]; 1 is perfect."""
 
     def both(value: Array, target: Array, weight: Array) -> Moments:
         return moments({"error": target - value, "target": target}, weight > 0)

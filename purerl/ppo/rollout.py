@@ -16,13 +16,14 @@ from purerl.core.records import (
     EpisodeStats,
     Metrics,
     Network,
+    Normal,
     PolicyOutput,
     PyTree,
     TrainState,
 )
 from purerl.ppo import distributions, running_moments
 from purerl.ppo.config import Config
-from purerl.ppo.noise import Prediction, action_noise, given
+from purerl.ppo.noise import action_noise
 
 
 class Transition(NamedTuple):
@@ -30,8 +31,8 @@ class Transition(NamedTuple):
 
     observation: PyTree  # [..., O] before the step
     raw_action: Array  # [..., A] before squashing
-    prediction: Prediction | None  # of its noise; None: white
-    log_prob: Array  # [...] of the raw action, under the policy that acted, given the prediction
+    noise: Normal | None  # [..., A] its noise given that before; None: white
+    log_prob: Array  # [...] of the raw action, under the policy that acted and such noise
     value: Array  # [...] V(s_t)
     reward: Array  # [...] unscaled
     discounted_return: Array  # [...] running, for reward scaling
@@ -192,11 +193,11 @@ def _step(
     fresh: State,
     carry: Carry,
     white: Array,
-    prediction: Prediction | None,
+    noise: Normal | None,
 ) -> tuple[Carry, Transition]:
     """Acts once in every environment, with noise of `white` [B, A]; `fresh` replaces what ended."""
     output, memory = act(network, state, carry.env, carry.memory)
-    distribution = given(output.distribution, prediction)
+    distribution = distributions.given(output.distribution, noise)
     raw = distributions.sample(distribution, white)
     action = distributions.to_action(raw)
     env_state, episode = step_episodes(env, carry.env, carry.episode, action)
@@ -214,7 +215,7 @@ def _step(
     transition = Transition(
         observation=observation,
         raw_action=raw,
-        prediction=prediction,
+        noise=noise,
         log_prob=log_prob,
         value=value,
         reward=reward,

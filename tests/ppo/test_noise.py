@@ -11,15 +11,15 @@ from scipy.stats import multivariate_normal
 
 from purerl.core.records import Normal
 from purerl.ppo.config import Config
-from purerl.ppo.distributions import normal_log_prob
-from purerl.ppo.noise import action_noise, coloring, given
+from purerl.ppo.distributions import given, normal_log_prob
+from purerl.ppo.noise import action_noise, coloring
 
 CONFIG = Config(num_steps=64 * 8, num_envs=8, rollout_length=64, num_minibatches=1)
 PINK = dataclasses.replace(CONFIG, noise_color=1.0)
 
 
 def noise_of(config, number, update=0):
-    """A rollout's white noise [T, B, 3] of environments `number`, and its predictions."""
+    """A rollout's white noise [T, B, 3] of environments, and what is known of each step's."""
     state = SimpleNamespace(
         key=jax.random.key(3), update=jnp.int32(update), number=jnp.asarray(number, jnp.int32)
     )
@@ -28,8 +28,8 @@ def noise_of(config, number, update=0):
 
 
 def colored(config, *rest):
-    white, prediction = noise_of(config, *rest)
-    return prediction.mean + prediction.std[..., None] * white
+    white, known = noise_of(config, *rest)
+    return known.loc + known.scale * white
 
 
 @pytest.mark.parametrize("length", [16, 63, 64, 3000])
@@ -67,20 +67,20 @@ def test_colored_noise_is_standard_normal_in_each_step_and_like_its_neighbours()
 
 
 def test_the_noise_before_tells_all_but_the_white_rest():
-    white, prediction = noise_of(PINK, range(2000))
+    white, known = noise_of(PINK, range(2000))
     noise = colored(PINK, range(2000))
     for lag in (1, 2, 10):
         assert abs((white[lag:] * noise[:-lag]).mean()) < 0.02
-    assert np.all(prediction.mean[0] == 0.0) and np.all(prediction.std[0] == 1.0)
-    assert prediction.std[-1] == pytest.approx(0.768, abs=0.001)
+    assert np.all(known.loc[0] == 0.0) and np.all(known.scale[0] == 1.0)
+    assert known.scale[-1] == pytest.approx(0.768, abs=0.001)
 
 
 def test_probabilities_of_single_actions_make_up_that_of_the_rollout():
     """The product of each given those before is the density of all T steps together."""
-    white, prediction = noise_of(PINK, [4])
+    white, known = noise_of(PINK, [4])
     loc = np.linspace(-1.0, 1.0, 64)[:, None, None] * np.ones(3)
     parameters = Normal(jnp.asarray(loc), jnp.full((64, 1, 3), 0.3))
-    distribution = given(parameters, prediction)
+    distribution = given(parameters, known)
     raw = distribution.loc + distribution.scale * white
     factor = coloring(64, 1.0)
     together = multivariate_normal(np.zeros(64), 0.3**2 * factor @ factor.T)
