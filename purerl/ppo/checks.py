@@ -15,8 +15,8 @@ TRAINING = (
     ("in [0, 1]", lambda x: 0.0 <= x <= 1.0, "gamma gae_lambda"),
     ("above 0, and finite", lambda x: 0.0 < x < math.inf, "learning_rate desired_kl reward_scale"),
     ("above 0, and finite", lambda x: 0.0 < x < math.inf, "clip max_gradient_norm"),
-    ("0 or above", lambda x: 0.0 <= x < math.inf, "value_weight entropy_weight"),
-    ("0 or above", lambda x: 0.0 <= x < math.inf, "shortest_episode advantage_clip"),
+    ("0 or above", lambda x: 0.0 <= x < math.inf, "value_weight entropy_weight advantage_clip"),
+    ("0 or above", lambda x: 0.0 <= x < math.inf, "min_advantage_std shortest_episode"),
     ("in [0, 2]", lambda x: 0.0 <= x <= 2.0, "noise_color"),
     ("finite", math.isfinite, "entropy_target"),
 )

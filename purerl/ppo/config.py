@@ -33,6 +33,8 @@ class Config:
     """Range of the policy ratio, 1 +- clip."""
     advantage_clip: float = 0.0
     """Range of the normalized advantage, +- so many standard deviations; 0: any."""
+    min_advantage_std: float = 0.0
+    """Least deviation that advantages are divided by [scaled reward]; 0: any, however small."""
     noise_color: float = 0.0
     """Exponent b of the action noise, of power 1 / f^b: 0 white, 1 pink, whose pushes last."""
     value_weight: float = 0.5
@@ -40,8 +42,7 @@ class Config:
     entropy_weight: float = 0.0
     """Weight of the entropy bonus."""
     entropy_target: float = 1.0
-    """Entropy up to which the bonus counts [nats for each action]; 1: always, as a uniform policy
-    has 0.69. Below that, a policy that explores already follows what it earns alone."""
+    """Entropy up to which the bonus counts [nats for each action]; a uniform policy has 0.69."""
     max_gradient_norm: float = 1.0
     """Gradients are scaled down to this global norm."""
     learning_rate: float = 3e-4

@@ -142,7 +142,8 @@ def loss(
     distribution = distributions.given(output.distribution, batch.noise)
     log_prob = distributions.log_prob(distribution, batch.raw_action)
     log_ratio = log_prob - batch.log_prob
-    advantage = losses.normalize_advantage(batch.advantage, scale, config.advantage_clip)
+    least, clip = config.min_advantage_std, config.advantage_clip
+    advantage = losses.normalize_advantage(batch.advantage, scale, least, clip)
     terms = {
         "policy_loss": losses.clipped_surrogate(log_ratio, advantage, config.clip),
         "value_loss": losses.value_loss(output.value, batch.target),

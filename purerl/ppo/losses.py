@@ -12,13 +12,14 @@ from purerl.core.records import Array
 from purerl.ppo.running_moments import Moments, moments, pool
 
 
-def normalize_advantage(advantage: Array, scale: Moments, clip: float = 0.0) -> Array:
-    """Returns the advantage with mean 0 and standard deviation 1, by a minibatch's moments [].
+def normalize_advantage(advantage: Array, scale: Moments, least: float, clip: float) -> Array:
+    """Returns the advantage less its mean, over its deviation, or `least` if that is more.
 
-    The same shape; clipped to +- `clip` unless that is 0. One failure among M samples that are
-    alike is sqrt(M) deviations away, and where it is negative the ratio's clip does not hold it.
+    By a minibatch's moments []; then clipped to +- `clip` unless that is 0. One failure among M
+    alike samples is sqrt(M) deviations away; the ratio's clip does not hold a negative one.
     """
-    normalized = (advantage - scale.mean) / (jnp.sqrt(scale.variance) + 1e-8)
+    deviation = jnp.sqrt(scale.variance) + 1e-8
+    normalized = (advantage - scale.mean) / (jnp.maximum(deviation, least) if least else deviation)
     return jnp.clip(normalized, -clip, clip) if clip else normalized
 
 

@@ -226,11 +226,10 @@ def _step(
         truncation_value=truncation_values(network, state, env_state, memory, truncated),
         valid=~lost,
     )
-    limit = time_limits(config, state.number)
     following = Carry(
         env=select(over, fresh, env_state),
         memory=jax.tree.map(lambda x: select(over, jnp.zeros_like(x), x), memory),
-        episode=select(over, start_episodes(fresh, limit), episode),
+        episode=select(over, start_episodes(fresh, time_limits(config, state.number)), episode),
         discounted_return=jnp.where(over, 0.0, discounted_return),
         sums=jax.tree.map(jnp.add, carry.sums, episode_sums(episode, over, lost)),
     )

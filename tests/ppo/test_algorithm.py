@@ -300,17 +300,20 @@ def test_a_lost_sample_has_no_weight_in_the_update():
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("clip", [0.0, 1.5])
-def test_advantages_are_clipped_after_they_are_normalized(clip):
+@pytest.mark.parametrize("least, clip", [(0.0, 0.0), (0.0, 1.5), (5.0, 0.0), (5.0, 1.5)])
+def test_advantages_are_clipped_after_they_are_normalized(least, clip):
     """The first ratio is 1: the loss of one minibatch is minus the mean of what it was given."""
     env, network, state = setup()
     _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
     batch = batches.make_batch(CONFIG, state, transitions, last_value, state.episode.length == 0)
     advantage = jnp.linspace(-1.0, 1.0, 96).reshape(16, 6).at[5, 2].set(-30.0)  # one failure
-    config = dataclasses.replace(CONFIG, num_epochs=1, num_minibatches=1, advantage_clip=clip)
+    config = dataclasses.replace(
+        CONFIG, num_epochs=1, num_minibatches=1, advantage_clip=clip, min_advantage_std=least
+    )
     batch = batch._replace(advantage=advantage)
     metrics = learn(config, network, state, batch, ())[1]
-    given = (advantage - advantage.mean()) / advantage.std()
+    assert 1.0 < advantage.std() < 5.0
+    given = (advantage - advantage.mean()) / max(advantage.std(), least)
     if clip:
         given = np.clip(given, -clip, clip)
     np.testing.assert_allclose(metrics["policy_loss"], -given.mean(), atol=1e-6)

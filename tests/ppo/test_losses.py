@@ -49,14 +49,14 @@ def test_value_loss():
 
 def test_weight_zero_removes_a_sample():
     x, weight = array(1.0, 100.0, 3.0), array(1.0, 0.0, 1.0)
-    normalized = losses.normalize_advantage(x, moments(x, weight > 0))
+    normalized = losses.normalize_advantage(x, moments(x, weight > 0), 0.0, 0.0)
     np.testing.assert_allclose(normalized[jnp.array([0, 2])], [-1.0, 1.0], rtol=1e-6)
 
 
 def test_advantage_normalized_over_all_axes():
     advantage = jax.random.normal(jax.random.key(0), (7, 5)) * 3.0 + 2.0
     scale = moments(advantage, jnp.ones((7, 5), bool))
-    normalized = np.asarray(losses.normalize_advantage(advantage, scale))
+    normalized = np.asarray(losses.normalize_advantage(advantage, scale, 0.0, 0.0))
     np.testing.assert_allclose(normalized.mean(), 0.0, atol=1e-6)
     np.testing.assert_allclose(normalized.std(), 1.0, rtol=1e-5)
 
@@ -64,10 +64,19 @@ def test_advantage_normalized_over_all_axes():
 def test_one_failure_among_alike_samples_is_clipped_and_the_others_are_not():
     advantage = jnp.zeros(100).at[3].set(-1.0)
     scale = moments(advantage, jnp.ones(100, bool))
-    whole = losses.normalize_advantage(advantage, scale)
-    clipped = losses.normalize_advantage(advantage, scale, 4.0)
+    whole = losses.normalize_advantage(advantage, scale, 0.0, 0.0)
+    clipped = losses.normalize_advantage(advantage, scale, 0.0, 4.0)
     np.testing.assert_allclose(whole[3], -np.sqrt(99.0), rtol=1e-5)
     np.testing.assert_array_equal(clipped, whole.at[3].set(-4.0))
+
+
+@pytest.mark.parametrize("size, expected", [(1e-4, 0.01), (1.0, 1.0)])
+def test_advantages_far_below_their_least_deviation_stay_small(size, expected):
+    """Where nothing is rewarded, they are errors of the value, and no reason to move."""
+    advantage = size * jax.random.normal(jax.random.key(0), (1000,))
+    scale = moments(advantage, jnp.ones(1000, bool))
+    normalized = losses.normalize_advantage(advantage, scale, 0.01, 0.0)
+    np.testing.assert_allclose(normalized.std(), expected, rtol=0.05)
 
 
 @pytest.mark.parametrize("target, expected", [(0.3, [-1.0, 0.5, 0.6]), (1.0, [-1.0, 0.5, 1.3])])
