@@ -31,7 +31,7 @@ def columns(recurrent):
     memory = state.carry  # before the rollout
     after, transitions, _, last_value = ROLLOUT(config, env, network, state)
     batch = batches.make_batch(config, after, transitions, last_value, state.episode.length == 0)
-    return config, network, after, learner.arrange(recurrent, batch), memory
+    return config, network, after, batch if recurrent else batches.in_one_row(batch), memory
 
 
 def cut(number, axis, tree):
@@ -81,7 +81,7 @@ def test_advantages_of_a_minibatch_are_scaled_by_its_own(name):
     shape = (number, 1, 12)
     advantage = jax.random.normal(jax.random.key(0), shape) * 3.0 + 1.0
     weight = jax.random.bernoulli(jax.random.key(1), 0.8, shape).astype(jnp.float32)
-    batch = batches.Batch(*[advantage] * 9)._replace(weight=weight)
+    batch = batches.Batch(*[advantage] * 9)._replace(weight=weight, noise=None)
     order = learner.shuffle(jax.random.key(2), jnp.arange(number), 12, 3)
     found = learner.advantage_scales(batch, order, parts)
     for k in range(3):
