@@ -171,10 +171,14 @@ def table(tasks: dict[str, list[Seed]], published: dict[str, dict[str, float]]) 
 def ahead(
     tasks: dict[str, list[Seed]], published: dict[str, dict[str, float]], column: str
 ) -> tuple[list[str], list[str]]:
-    """Returns the tasks whose IQM is at or above a published column, and those that fall short."""
+    """Returns the tasks whose IQM is at or above a published column, and those that fall short.
+
+    What was published is whole numbers, so the IQM is rounded for this too: 999.7 is no less than
+    a 1000 that may be 999.6.
+    """
     compared = [task for task in tasks if column in published.get(task, {})]
-    scores = dict(zip(tasks, strata(tasks), strict=True))
-    reached = {t: bootstrap.interquartile_mean(scores[t]) >= published[t][column] for t in compared}
+    scores = dict(zip(tasks, map(bootstrap.interquartile_mean, strata(tasks)), strict=True))
+    reached = {task: round(scores[task]) >= published[task][column] for task in compared}
     return [t for t in compared if reached[t]], [t for t in compared if not reached[t]]
 
 

@@ -86,6 +86,13 @@ def test_ahead_is_at_or_above():
     assert suite_scores.ahead(tasks, published, "y") == ([], ["cheetah-run"])
 
 
+@pytest.mark.parametrize(("score", "reached"), [(999.6, True), (999.4, False)])
+def test_a_published_whole_number_is_reached_by_what_rounds_to_it(score, reached):
+    tasks = suite_scores.by_task([seed(1, score)])
+    above, _ = suite_scores.ahead(tasks, {"cheetah-run": {"x": 1000.0}}, "x")
+    assert bool(above) == reached
+
+
 def test_the_profile_weighs_tasks_equally():
     share, low, high = suite_scores.profile(suite_scores.by_task(SEEDS))
     at = {level: share[i] for i, level in enumerate(suite_scores.LEVELS)}
