@@ -178,7 +178,7 @@ def ahead(
     """
     compared = [task for task in tasks if column in published.get(task, {})]
     scores = dict(zip(tasks, map(bootstrap.interquartile_mean, strata(tasks)), strict=True))
-    reached = {task: round(scores[task]) >= published[task][column] for task in compared}
+    reached = {task: bool(np.rint(scores[task]) >= published[task][column]) for task in compared}
     return [t for t in compared if reached[t]], [t for t in compared if not reached[t]]
 
 
