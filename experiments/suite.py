@@ -19,12 +19,14 @@ experiment = Experiment(
         min_std=0.2,  # with 0.001, a cart-pole's was 0.04, steps became leaps, and the pole fell
     ),
     ppo=Config(
-        num_steps=3_000_000,
+        num_steps=10_000_000,
         num_envs=64,
-        rollout_length=64,
-        shortest_episode=64,  # where the goal is reached soon, starts are what is to be learned
+        rollout_length=128,  # no push of the noise lasts longer, and a swing of a pole has 160
+        shortest_episode=32,  # where the goal is reached soon, starts are what is to be learned
         num_epochs=4,
-        num_minibatches=8,
+        num_minibatches=16,
+        noise_color=0.75,  # with white noise, a pole that hangs is never found upright
+        min_advantage_std=0.01,  # without it, a policy that has earned nothing yet follows noise
         learning_rate=1e-3,
         schedule="linear",
         advantage_clip=4.0,  # without it, one fall of a pole that always stood undid a policy
@@ -33,5 +35,5 @@ experiment = Experiment(
         reward_scaling="return_std",
         reward_scale=1.0,
     ),
-    evaluation=Evaluation(num_episodes=32, number=6),
+    evaluation=Evaluation(num_episodes=32, number=10),
 )
