@@ -2,7 +2,7 @@
 
 python -m purerl.run suite --env.task cheetah-run --name cheetah-run
 
-Expected: return 800 of 1000 after 2.5 min, on one CPU core; others: docs/measurements/suite.md.
+Expected: return 915 of 1000 after 10 min, on one CPU core; others: docs/measurements/suite.md.
 """
 
 from envs.suite import tasks
