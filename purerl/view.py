@@ -47,7 +47,9 @@ def has_viser() -> bool:
 
 def command(words: Sequence[str]) -> None:
     """Opens the page and plays until Ctrl-C."""
-    if not has_viser():
+    found = find(words, PROG)
+    chosen, options = settings_of(found, words[1:], f"{PROG} {found.name}", Options)
+    if not has_viser():  # its help needs no window
         raise UserError(
             "The window needs the package viser: pip install -c constraints.txt -e '.[view]'."
         )
@@ -55,8 +57,6 @@ def command(words: Sequence[str]) -> None:
     from purerl.tune.view.loop import check_port, play
     from purerl.tune.view.page import Page
 
-    found = find(words, PROG)
-    chosen, options = settings_of(found, words[1:], f"{PROG} {found.name}", Options)
     check_port(options.host, options.port)
     session, source, title = opening.open_window(found, chosen, options)
     page = Page(options.host, options.port, title)

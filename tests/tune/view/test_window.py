@@ -153,6 +153,15 @@ def test_the_sliders_begin_where_the_command_line_puts_them(trained, of):
     assert source.words(session.numbers) == "--env.bonus 3.0 --env.width 0.25"
 
 
+def test_help_needs_no_package_that_draws(monkeypatch, capsys):
+    monkeypatch.setattr(view, "has_viser", lambda: False)
+    with pytest.raises(SystemExit, match="^0$"):
+        view.main(["cartpole_swingup", "--help"])
+    assert "--horizon" in capsys.readouterr().out
+    assert view.main(["cartpole_swingup"]) == USAGE
+    assert "'.[view]'" in only_line(capsys)
+
+
 @pytest.mark.slow
 @needs_viser
 def test_mistakes_are_one_line_and_nothing_in_the_run_changes(trained, tmp_path, capsys):
