@@ -1,8 +1,9 @@
-"""dm_control's control suite, all 28 tasks of its benchmark with the same settings.
+"""dm_control's control suite, the 28 tasks of its benchmark, with one set of settings.
 
 python -m purerl.run suite --env.task cheetah-run --name cheetah-run
 
 Expected: return 915 of 1000 after 10 min, on one CPU core; others: docs/measurements/suite.md.
+The humanoids learn nothing with these; `suite_humanoid` has two other numbers.
 """
 
 from envs.suite import tasks

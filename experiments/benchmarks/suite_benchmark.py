@@ -7,8 +7,8 @@
 Other words are settings, as `python -m purerl.run suite --help` lists them. All seeds of a task
 are vmapped in one process, as many processes at once as the machine takes. The same command goes
 on with what was stopped; a seed that fails is counted as failed. It is a sweep over `env.task`, and
-its folder is one of `python -m purerl.sweep`. What several machines have trained becomes one table
-by `--scores`.
+its folder is one of `python -m purerl.sweep`; the humanoids, with two numbers of their own, are a
+second one. What several machines have trained becomes one table by `--scores`.
 """
 
 import argparse
@@ -54,14 +54,36 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for task in options.tasks:
         if task not in TASKS:
             raise UserError(unknown_name("task", task, TASKS))
-    folder = Path("sweeps") / options.name
-    code = sweep([*words(options, settings)])
-    if code != USAGE:
-        seeds = scored(folder / "suite") if folder.is_dir() else []
-        if code != INTERRUPTED:
-            seeds += never_begun(options, seeds)
-        report(seeds, options.out or folder)
+    return train(options, settings)
+
+
+def train(options: argparse.Namespace, settings: Sequence[str]) -> int:
+    """Carries out a sweep for each experiment that has some of the tasks, and scores all runs."""
+    folders: list[Path] = []
+    code = SUCCESS
+    for experiment, tasks in by_experiment(options.tasks or TASKS).items():
+        name = options.name + experiment.removeprefix("suite")
+        last = sweep(words(options, experiment, tasks, name, settings))
+        if last == USAGE:
+            return last
+        folders.append(Path("sweeps") / name / experiment)
+        code = max(code, last)
+        if last == INTERRUPTED:
+            break
+    seeds = [s for folder in folders if folder.is_dir() for s in scored(folder)]
+    if code != INTERRUPTED:
+        seeds += never_begun(options, seeds)
+    report(seeds, options.out or folders[0].parent)
     return code
+
+
+def by_experiment(tasks: Iterable[str]) -> dict[str, list[str]]:
+    """Returns experiment -> those of the tasks that are trained with its settings."""
+    found: dict[str, list[str]] = {}
+    for task in tasks:
+        name = "suite_humanoid" if task.startswith("humanoid-") else "suite"
+        found.setdefault(name, []).append(task)
+    return found
 
 
 def scored(place: Path) -> list[suite_scores.Seed]:
@@ -82,14 +104,20 @@ def never_begun(
     return [suite_scores.Seed(*one, "failed", (), (), ()) for one in every if one not in known]
 
 
-def words(options: argparse.Namespace, settings: Sequence[str]) -> list[str]:
-    """Returns the sweep's command line: a point for each task, a run for each seed."""
+def words(
+    options: argparse.Namespace,
+    experiment: str,
+    tasks: Sequence[str],
+    name: str,
+    settings: Sequence[str],
+) -> list[str]:
+    """Returns a sweep's command line: a point for each task, a run for each seed."""
     return [
-        "suite",
-        *("--grid", f"env.task={','.join(options.tasks or TASKS)}"),
+        experiment,
+        *("--grid", f"env.task={','.join(tasks)}"),
         *("--seeds", str(options.seeds), "--seed", str(options.first_seed)),
         *("--ppo.num-steps", str(options.steps), "--evaluation.number", "20"),
-        *("--jobs", str(options.jobs), "--name", options.name),
+        *("--jobs", str(options.jobs), "--name", name),
         *settings,
     ]
 

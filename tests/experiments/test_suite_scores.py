@@ -8,7 +8,7 @@ import pytest
 from envs.suite.tasks import TASKS
 from experiments.benchmarks import suite_benchmark, suite_pictures, suite_scores
 from experiments.benchmarks.suite_scores import Seed
-from purerl.core.errors import UserError
+from purerl.core.errors import INTERRUPTED, SUCCESS, USAGE, UserError
 
 
 def seed(number, *returns, task="cheetah-run", status="done"):
@@ -130,6 +130,25 @@ def test_a_seed_that_never_had_a_folder_counts_as_failed():
         ("hopper-hop", 2, 0.0),
     ]
     assert len(suite_scores.by_task(missing)["hopper-hop"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("codes", "ends_with"),
+    [([SUCCESS, INTERRUPTED], INTERRUPTED), ([INTERRUPTED], INTERRUPTED), ([USAGE], USAGE)],
+)
+def test_humanoids_are_a_sweep_of_their_own(codes, ends_with, monkeypatch, tmp_path):
+    sweeps, left = [], list(codes)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(suite_benchmark, "sweep", lambda w: sweeps.append(w) or left.pop(0))
+    asked = ["humanoid-walk", "cheetah-run", "humanoid-run", "--name", "mine"]
+    assert suite_benchmark.main([*asked, "--ppo.gamma", "0.9"]) == ends_with
+    begun = [(words[0], words[2], words[words.index("--name") + 1]) for words in sweeps]
+    wanted = [
+        ("suite_humanoid", "env.task=humanoid-walk,humanoid-run", "mine_humanoid"),
+        ("suite", "env.task=cheetah-run", "mine"),
+    ]
+    assert begun == wanted[: len(codes)]
+    assert all(words[-2:] == ["--ppo.gamma", "0.9"] for words in sweeps)
 
 
 @pytest.mark.slow
