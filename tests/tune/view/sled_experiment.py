@@ -1,4 +1,7 @@
-"""A box that a motor moves along x, in the air: with options of every kind that a slider meets."""
+"""A box that a motor moves along x, in the air: with options of every kind that a slider meets.
+
+The floor below it, which it cannot touch, is there for its shadow.
+"""
 
 import dataclasses
 from typing import Any
@@ -13,6 +16,7 @@ XML = """
 <mujoco>
   <option gravity="0 0 0" timestep="0.01"/>
   <worldbody>
+    <geom name="floor" type="plane" pos="0 0 -0.4" size="3 3 0.1" contype="0" conaffinity="0"/>
     <body name="box">
       <joint name="x" type="slide" axis="1 0 0" damping="0.2"/>
       <joint name="y" type="slide" axis="0 1 0"/>
