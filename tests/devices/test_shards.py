@@ -119,6 +119,7 @@ LARGER = ["--ppo.num-envs", "64", "--ppo.rollout-length", "8", "--ppo.num-steps"
 TRAINING = ["--evaluation.number", "0"]
 
 
+@pytest.mark.slow
 def test_by_default_every_device_has_a_shard(tmp_path):
     words = [str(TOY), *LARGER, *TRAINING]
     said = start(tmp_path, 2, *words, "--name", "default")

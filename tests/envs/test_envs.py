@@ -74,6 +74,7 @@ def test_engines_agree(name):
     assert float(jnp.abs(c.physics.qpos[-1] - c.physics.qpos[0]).max()) > 0.1  # something moved
 
 
+@pytest.mark.slow
 def test_engines_agree_closely_without_contacts():
     """Joint limits, actuators, damping and gravity of a falling ant."""
     c, mjx = trajectory("ant", "c", 5.0), trajectory("ant", "jax", 5.0)

@@ -203,7 +203,7 @@ def test_batching_changes_no_bit_on_c():
             np.testing.assert_array_equal(x, z[i // 3, i % 3])
 
 
-@pytest.mark.parametrize("engine", ["c", "jax"])
+@pytest.mark.parametrize("engine", ["c", pytest.param("jax", marks=pytest.mark.slow)])
 def test_a_blow_up_is_nan_and_touches_no_other(engine):
     step = compiled(engine)[1]
     state = jax.tree.map(lambda x: x[0], trajectory("c")[1])

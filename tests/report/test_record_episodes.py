@@ -60,6 +60,7 @@ def lstm(tmp_path_factory) -> Recorded:
     return train_and_record(tmp_path_factory.mktemp("lstm"), "recurrent", LSTM)
 
 
+@pytest.mark.slow
 def test_its_episodes_begin_as_those_of_an_evaluation(lstm, tmp_path):
     folder, arrays, _ = lstm
     file = tmp_path / "judged.json"

@@ -60,6 +60,7 @@ def written(folder: Path) -> dict:
     }
 
 
+@pytest.mark.slow
 def test_it_makes_the_same_run_as_the_command(tmp_path):
     """Each in a process of its own, as users have it; in the one, JAX has begun before."""
     script = (
