@@ -5,8 +5,9 @@ import os
 import shutil
 import tempfile
 
-# Reported cure for hangs of XLA's CPU pool on large vmapped programs, and bits that do not depend
-# on the number of cores; it must be set before JAX starts.
+# Reported cure for hangs of XLA's CPU pool on large vmapped programs (not of those that
+# `purerl/runs/console.py` tells of), and bits that do not depend on the number of cores; it must be
+# set before JAX starts.
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
 
 # Compiling takes most of the time of these tests: it is done once for all their processes.

@@ -19,6 +19,9 @@ from purerl.runs.loop import Plan
 SECONDS_BETWEEN_LINES = 2.0
 # Or one would think that it hangs.
 SLOW_BEGINNINGS = {"warp": "; its kernels, once on a machine, take a minute or more of an update"}
+# jaxlib's factorisation of a batch waits, on one of XLA's threads, for parts that it gives to the
+# others. Two at once, on two threads, wait for each other.
+STALLS = "; on two of XLA's threads its physics can stop for ever: set NPROC=4, or take engine c"
 
 
 def describe_plan(
@@ -53,13 +56,19 @@ def describe_plan(
         "metrics": f"a line every {plan.log_every} updates",
         "parameters": f"{parameters:,}",
         "state": f"{size(abstract) / 1e6:,.1f} MB",
-        "engine": f"{setup.engine}{SLOW_BEGINNINGS.get(setup.engine, '')}",
+        "engine": f"{setup.engine}{engine_remark(setup.engine, kind)}",
         "shards": number > 1 and f"{number}, {each}",
         "device": f"{devices} x {kind['kind']} ({kind['platform']})",
         "cache": cache,
         "bit-exact": f"no: {inexact}" if inexact else "yes",
     }
     return [f"{name:12} {value}" for name, value in lines.items() if value]
+
+
+def engine_remark(engine: str, device: dict[str, Any]) -> str:
+    """Returns what to know beforehand of an engine on a device, as in manifest.json."""
+    stalls = engine == "jax" and device.get("threads") == 2  # which only a CPU has there
+    return STALLS if stalls else SLOW_BEGINNINGS.get(engine, "")
 
 
 def _ticks(updates: tuple[int, ...]) -> str:
