@@ -21,7 +21,7 @@ SECONDS_BETWEEN_LINES = 2.0
 SLOW_BEGINNINGS = {"warp": "; its kernels, once on a machine, take a minute or more of an update"}
 # jaxlib's factorisation of a batch waits, on one of XLA's threads, for parts that it gives to the
 # others. Two at once, on two threads, wait for each other.
-STALLS = "; on two of XLA's threads its physics can stop for ever: set NPROC=4, or take engine c"
+STALLS = "; on two of XLA's threads its physics can stop for ever: set NPROC=1, or take engine c"
 
 
 def describe_plan(

@@ -66,7 +66,7 @@ def main(arguments: list[str]) -> int:
 def ask_cpu(words: list[str]) -> None:
     """Has a process compute on the CPU."""
     # On two of XLA's threads, MJX's factorisations can wait for each other for ever.
-    threads = os.environ.get("NPROC", "4")
+    threads = os.environ.get("NPROC", "1")
     subprocess.run(
         [sys.executable, "-m", "tests.checks.platforms", *words],
         env=os.environ | {"JAX_PLATFORMS": "cpu", "NPROC": threads}, check=True,
