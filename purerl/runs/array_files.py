@@ -52,10 +52,10 @@ def _orbax() -> Any:
     return orbax.checkpoint
 
 
-def _print_unraisable(raised: Any) -> None:
+def _print_unraisable(raised: Any, show: Any = sys.__unraisablehook__) -> None:
     """Prints what could not be raised, but not what a failed save's unfinished writes end with.
 
     They end one by one, in threads of the storage library, after the failure has been reported.
     """
     if str(raised.exc_value) != "Event loop is closed":
-        sys.__unraisablehook__(raised)
+        show(raised)  # while Python ends, `sys` is None

@@ -63,7 +63,7 @@ class Policy:
 
         Raises:
           UserError: the observation has another shape, or another number of environments than
-            the memory.
+            the memory, or is traced.
         """
         batch, flat = _flatten(observation, self._example)
         if self._memory is None:
@@ -79,6 +79,12 @@ class Policy:
 
 def _flatten(observation: Any, example: PyTree) -> tuple[tuple[int, ...], PyTree]:
     """Returns the leading axes of leaves [..., O], and the leaves as [B, O]; `example` has [O]."""
+    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(observation)):
+        raise UserError(
+            "The observation is traced, by jax.jit, vmap or scan, and a policy takes numbers: it "
+            "keeps its memory from call to call. Compile env.step alone, and call the policy "
+            "between steps; docs/howto/own_loop.md has whole episodes compiled."
+        )
     try:
         arrays = jax.tree.map(lambda _, x: np.asarray(x, np.float32), example, observation)
     except (TypeError, ValueError):

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import time
+import types
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -355,6 +356,14 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="x.json cannot be written: Input/output error"):
         files.write_json(path, {"a": 2})
     assert json.loads(path.read_text()) == {"a": 1}
+
+
+def test_what_cannot_be_raised_is_told_while_python_ends(monkeypatch):
+    monkeypatch.setattr(array_files, "sys", None)  # as modules are then
+    late, other = (types.SimpleNamespace(exc_value=e) for e in ("Event loop is closed", "other"))
+    array_files._print_unraisable(late)  # not told
+    with pytest.raises(TypeError, match="UnraisableHookArgs"):  # of Python
+        array_files._print_unraisable(other)
 
 
 def test_the_hash_of_files_is_that_of_their_bytes(tmp_path):

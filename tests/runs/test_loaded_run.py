@@ -149,6 +149,14 @@ def test_the_examples_in_the_docstrings_hold(tmp_path, capsys):
     assert runner.failures == 0, capsys.readouterr().out
 
 
+def test_a_policy_inside_of_jit_says_what_to_do(run):
+    state = run.env.reset(jax.random.key(0))
+    run.policy.reset()
+    with pytest.raises(purerl.UserError, match=r"is traced, by jax.jit.*Compile env.step alone"):
+        jax.jit(lambda state: run.env.step(state, run.policy(state.observation)))(state)
+    assert run.policy(state.observation).shape == (1,)  # nothing traced has got into its memory
+
+
 def test_a_policy_needs_no_run(run):
     made = purerl.Policy(run.env, run.network, run.state)
     observation = run.env.reset(jax.random.key(3)).observation
