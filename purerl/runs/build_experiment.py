@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from purerl.core.env import Env, EnvError
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.records import Network, PolicyOutput, PyTree
-from purerl.devices import memory
+from purerl.devices import memory, threads
 from purerl.devices.check_sizes import check_minibatches
 from purerl.devices.programs import abstract_state
 from purerl.ppo.config import Config
@@ -37,6 +37,7 @@ def build(chosen: Experiment) -> Setup:
     _check_precision()
     check_takes("build_env", chosen.build_env, "options", "engine")
     check_takes("build_network", chosen.build_network, "options", "observation", "action_size")
+    threads.leave_one(chosen.engine)
     with told(""):
         engine = choose_engine(chosen.engine)
     with told("build_env: "):

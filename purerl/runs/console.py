@@ -10,6 +10,7 @@ from typing import Any
 import jax
 
 from purerl.core.records import PyTree
+from purerl.devices import threads
 from purerl.devices.memory import size
 from purerl.runs import output
 from purerl.runs.build_experiment import Setup
@@ -19,8 +20,7 @@ from purerl.runs.loop import Plan
 SECONDS_BETWEEN_LINES = 2.0
 # Or one would think that it hangs.
 SLOW_BEGINNINGS = {"warp": "; its kernels, once on a machine, take a minute or more of an update"}
-# jaxlib's factorisation of a batch waits, on one of XLA's threads, for parts that it gives to the
-# others. Two at once, on two threads, wait for each other.
+# Where NPROC says two, or JAX began before this run: else `threads.leave_one` has left one.
 STALLS = "; on two of XLA's threads its physics can stop for ever: set NPROC=1, or take engine c"
 
 
@@ -67,7 +67,7 @@ def describe_plan(
 
 def engine_remark(engine: str, device: dict[str, Any]) -> str:
     """Returns what to know beforehand of an engine on a device, as in manifest.json."""
-    stalls = engine == "jax" and device.get("threads") == 2  # which only a CPU has there
+    stalls = engine == "jax" and device.get("threads") == threads.STALLING  # a CPU's
     return STALLS if stalls else SLOW_BEGINNINGS.get(engine, "")
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from purerl import exact
 from purerl.core.errors import UserError
+from purerl.devices.threads import cpu_threads
 from purerl.runs.files import check_object, read_json
 from purerl.runs.source_hashes import source_hashes
 
@@ -122,12 +123,6 @@ def _flags() -> dict[str, str]:
         words = found["XLA_FLAGS"].split()
         found["XLA_FLAGS"] = " ".join(w for w in words if "platform_device_count" not in w)
     return found
-
-
-def cpu_threads() -> int:
-    """Returns the size of XLA's CPU thread pool: NPROC where it is set, else the usable cores."""
-    pinned = os.environ.get("NPROC", "") or os.environ.get("PJRT_NPROC", "")
-    return int(pinned) if pinned.isdigit() else len(os.sched_getaffinity(0))
 
 
 def differences(old: Any, new: Any, path: str = "") -> list[str]:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import UserError
+from purerl.devices import threads
 from purerl.exact import xla_flags
 from purerl.runs import output
 from purerl.runs.command_line import from_settings
@@ -93,6 +94,7 @@ def train_runs(
     remember(source.text, source.path)
     if options.portable or (options.resume and any(map(manifest.was_portable, runs))):
         set_portable_flags_in_time()
+    threads.leave_one(chosen.engine)
     with stop_signals(end) as stop:
         execute(source, runs, options, stop)
     return list(runs)
@@ -124,7 +126,7 @@ def set_portable_flags_in_time() -> None:
             "Portable bits are those of x86-64 processors with AVX2 and FMA, and this one "
             f"({processor('model name') or platform.machine()}) has not both; leave out --portable."
         )
-    if _jax_has_begun() and not xla_flags.is_portable():
+    if threads.jax_has_begun() and not xla_flags.is_portable():
         raise UserError(
             "JAX has begun with other flags than portable bits need: begin a new process, or call "
             "purerl.exact.set_portable_flags() before JAX's first computation."
@@ -135,16 +137,8 @@ def set_portable_flags_in_time() -> None:
         raise UserError(str(error)) from error
 
 
-def _jax_has_begun() -> bool:
-    if "jax" not in sys.modules:
-        return False
-    from jax._src import xla_bridge  # JAX has no public way to ask without starting it
-
-    return xla_bridge.backends_are_initialized()
-
-
 def _runs_on_gpu() -> bool:
-    return _jax_has_begun() and sys.modules["jax"].default_backend() == "gpu"
+    return threads.jax_has_begun() and sys.modules["jax"].default_backend() == "gpu"
 
 
 @contextmanager

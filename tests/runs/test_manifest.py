@@ -75,11 +75,6 @@ def test_the_fingerprint_follows_what_can_change_bits_only():
         assert fingerprint(*other) != mine
 
 
-def test_a_pinned_thread_pool_counts_as_pinned(monkeypatch):
-    monkeypatch.setenv("NPROC", "13")
-    assert manifest.cpu_threads() == 13
-
-
 def test_a_manifest_says_whether_the_run_is_exact_and_what_prevents_it(monkeypatch):
     assert manifest.collect("c", [])["bit_exact"] is True
     warp = manifest.collect("warp", [])
