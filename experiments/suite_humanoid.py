@@ -3,7 +3,7 @@
 python -m purerl.run suite_humanoid --env.task humanoid-walk
 
 Expected: return 311 to 409 of 1000 with four of five seeds, and 8 with the fifth; 38 min on one CPU
-core. It gets up and walks. humanoid-stand learns nothing in as many steps.
+core. It gets up and walks. humanoid-stand and humanoid-run learn nothing in as many steps.
 """
 
 import dataclasses
