@@ -39,6 +39,7 @@ def leave_one(engine: str) -> None:
     """
     stalls = engine == "jax" and cpu_threads() == STALLING and not _pinned()
     several = "platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    several |= "JAX_NUM_CPU_DEVICES" in os.environ
     on_cpu = os.environ.get("JAX_PLATFORMS") == "cpu" or not Path("/dev/nvidiactl").exists()
     if stalls and on_cpu and not several and not jax_has_begun():
         os.environ["NPROC"] = "1"

@@ -14,6 +14,11 @@ ROOT = Path(__file__).parents[2]
 SEVERAL = "--xla_a=b --xla_force_host_platform_device_count=2"
 
 
+def test_a_pinned_thread_pool_counts_as_pinned(monkeypatch):
+    monkeypatch.setenv("NPROC", "13")
+    assert threads.cpu_threads() == 13
+
+
 @pytest.mark.parametrize(
     ("engine", "cores", "environment", "begun", "then"),
     [
@@ -27,6 +32,7 @@ SEVERAL = "--xla_a=b --xla_force_host_platform_device_count=2"
         ("jax", 8, {"NPROC": "2"}, False, "2"),  # the user's own, who is told
         ("jax", 2, {"NPROC": "4"}, False, "4"),
         ("jax", 2, {"XLA_FLAGS": SEVERAL}, False, None),
+        ("jax", 2, {"JAX_NUM_CPU_DEVICES": "2"}, False, None),
     ],
 )
 def test_one_thread_is_left_where_two_would_stop(
