@@ -12,8 +12,8 @@ python -m purerl.run rodent_gaps --engine warp --ppo.num-envs 4096 --ppo.rollout
     --ppo.num-minibatches 64 --ppo.num-steps 160000000
 
 With fewer environments it learns in fewer steps. Five seeds, the three of this command and two more
-at once, cross 5, 19, 5, 18 and 8 gaps after 26 M, all in 23 min of one H100. Faster ones leap
-wider gaps:
+at once, cross 5, 19, 5, 18 and 8 gaps after 26 M, all in 23 min of one H100. The fastest
+cross the most:
 
 python -m purerl.run rodent_gaps --engine warp --num-seeds 3 --seed 20 --ppo.num-envs 1024 \
     --ppo.rollout-length 16 --ppo.num-minibatches 16 --ppo.num-steps 26000000
