@@ -5,6 +5,7 @@ r"""How many gaps a policy crosses in corridors that it has never seen, beside s
 
 The floor policy is one trained without gaps: put into the corridor, it does not see them (what
 lies ahead stands at the end of the observation, and is cut off). "Still" holds all actions at 0.
+"Whole" is the share of episodes that last up to the time limit, without a fall.
 """
 
 import argparse
@@ -68,14 +69,15 @@ def still(action_size: int) -> Network:
     return Network(lambda key: ((), ()), apply)
 
 
-def report(name: str, result: dict[str, Any]) -> str:
-    """Formats one policy's distribution of gaps crossed."""
+def report(name: str, result: dict[str, Any], limit: int) -> str:
+    """Formats one policy's distribution of gaps crossed; `limit` [control steps] of an episode."""
     gaps = result["gaps_crossed_count"]
     quantiles = np.quantile(gaps, [0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0])
     figures = " | ".join(f"{q:.0f}" for q in quantiles)
     some, five = np.mean(gaps >= 1), np.mean(gaps >= 5)
-    speed = result["forward_velocity"].mean()
-    return f"| {name} | {gaps.mean():.1f} | {some:.0%} | {five:.0%} | {figures} | {speed:.2f} |"
+    whole, speed = np.mean(result["episode_length"] == limit), result["forward_velocity"].mean()
+    shares = f"{some:.0%} | {five:.0%} | {whole:.0%}"
+    return f"| {name} | {gaps.mean():.1f} | {shares} | {figures} | {speed:.2f} |"
 
 
 def main(arguments: list[str]) -> int:
@@ -102,12 +104,14 @@ def main(arguments: list[str]) -> int:
         network = blind(floor.setup.network, size)
         policies["floor"] = setup._replace(network=network), widen(floor.saved.state, extra)
     policies["still"] = setup._replace(network=still(setup.env.action_size)), state
-    limit = setup.config.episode_length * setup.env.control_timestep
-    print(f"{options.episodes} corridors, at most {limit:.0f} s each, deterministic policies")
-    print("| policy | gaps, mean | >= 1 | >= 5 | min | 10% | 25% | 50% | 75% | 90% | max | m/s |")
-    print("|" + "---|" * 12)
+    limit = setup.config.episode_length
+    seconds = limit * setup.env.control_timestep
+    print(f"{options.episodes} corridors, at most {seconds:.0f} s each, deterministic policies")
+    shares, quantiles = ">= 1 | >= 5 | whole", "min | 10% | 25% | 50% | 75% | 90% | max"
+    print(f"| policy | gaps, mean | {shares} | {quantiles} | m/s |\n|" + "---|" * 13)
     for name, (policy, its_state) in policies.items():
-        print(report(name, gaps_of(policy, its_state, options.seed, options.episodes)), flush=True)
+        result = gaps_of(policy, its_state, options.seed, options.episodes)
+        print(report(name, result, limit), flush=True)
     return 0
 
 
