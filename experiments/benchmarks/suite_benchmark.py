@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     options, settings = parser.parse_known_args(arguments)
     if options.scores is not None:
-        report(suite_scores.merged(map(scored, options.scores)), options.out or Path("."))
+        report(suite_scores.merged(map(given, options.scores)), options.out or Path("."))
         return SUCCESS
     for task in options.tasks:
         if task not in TASKS:
@@ -92,6 +92,18 @@ def scored(place: Path) -> list[suite_scores.Seed]:
         return suite_scores.read_seeds(place)
     runs = map(read, runs_in(place))
     return [suite_scores.seed_of(run) for run in runs if "env.task" in run.settings]
+
+
+def given(place: Path) -> list[suite_scores.Seed]:
+    """Returns what `scored` does; UserError if that is nothing, as of a mistyped folder."""
+    if not place.exists():
+        raise UserError(f"There is no {place}: give a seeds.csv, or a folder of runs.")
+    if seeds := scored(place):
+        return seeds
+    raise UserError(
+        f"{place} has no seed of the control suite: give a seeds.csv, or a folder of runs, "
+        "each of which has a config.json with env.task."
+    )
 
 
 def never_begun(

@@ -69,6 +69,16 @@ def test_a_file_that_is_no_table_or_ends_early_is_named(tmp_path, content):
         suite_benchmark.main(["--scores", str(path)])
 
 
+@pytest.mark.parametrize("name", ["mistyped", "other"])
+def test_a_place_without_a_run_is_named_and_nothing_is_written(tmp_path, name):
+    """An empty table would replace the one that is there."""
+    (tmp_path / "other" / "run").mkdir(parents=True)
+    out = tmp_path / "out"
+    with pytest.raises(UserError, match=rf"{name}.*: give a seeds.csv, or a folder of runs"):
+        suite_benchmark.main(["--scores", str(tmp_path / name), "--out", str(out)])
+    assert not out.exists()
+
+
 def test_of_a_seed_that_two_machines_have_the_longer_counts(tmp_path):
     short, long = seed(1, 5.0, status="unfinished"), seed(1, 5.0, 7.0)
     other = seed(2, 1.0)
