@@ -5,7 +5,8 @@ r"""How many gaps a policy crosses in corridors that it has never seen, beside s
 
 The floor policy is one trained without gaps: put into the corridor, it does not see them (what
 lies ahead stands at the end of the observation, and is cut off). "Still" holds all actions at 0.
-"Whole" is the share of episodes that last up to the time limit, without a fall.
+"Whole" is the share of episodes that last up to the time limit, without a fall; one that reaches
+the corridor's end before is not counted.
 """
 
 import argparse

@@ -71,7 +71,7 @@ def test_a_file_that_is_no_table_or_ends_early_is_named(tmp_path, content):
 
 @pytest.mark.parametrize("name", ["mistyped", "other"])
 def test_a_place_without_a_run_is_named_and_nothing_is_written(tmp_path, name):
-    """An empty table would replace the one that is there."""
+    """Beside other places, a table without its seeds would look whole."""
     (tmp_path / "other" / "run").mkdir(parents=True)
     out = tmp_path / "out"
     with pytest.raises(UserError, match=rf"{name}.*: give a seeds.csv, or a folder of runs"):
