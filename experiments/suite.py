@@ -3,7 +3,7 @@
 python -m purerl.run suite --env.task cheetah-run --name cheetah-run
 
 Expected: return 915 of 1000 after 10 min, on one CPU core; others: docs/measurements/suite.md.
-Humanoids learn nothing with these; those of `suite_humanoid` differ in two numbers.
+Humanoids learn nothing with these: `suite_humanoid` has settings for them.
 """
 
 from envs.suite import tasks

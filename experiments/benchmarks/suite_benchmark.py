@@ -7,7 +7,7 @@
 Other words are settings, as `python -m purerl.run suite --help` lists them. All seeds of a task
 are vmapped in one process, as many processes at once as the machine takes. The same command goes
 on with what was stopped; a seed that fails is counted as failed. It is a sweep over `env.task`, and
-its folder is one of `python -m purerl.sweep`; the humanoids, with two numbers of their own, are a
+its folder is one of `python -m purerl.sweep`; the humanoids, with settings of their own, are a
 second one. What several machines have trained becomes one table by `--scores`.
 """
 
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("tasks", nargs="*", help="which tasks; all by default")
-    parser.add_argument("--steps", type=int, default=10_000_000, help="control steps of each run")
+    parser.add_argument("--steps", type=int, help="control steps of each run; the experiment's own")
     parser.add_argument("--seeds", type=int, default=5, help="seeds of each task")
     parser.add_argument("--first-seed", type=int, default=20, help="others than those chosen on")
     parser.add_argument("--jobs", type=int, default=0, help="processes at once; 0: by the machine")
@@ -128,7 +128,8 @@ def words(
         experiment,
         *("--grid", f"env.task={','.join(tasks)}"),
         *("--seeds", str(options.seeds), "--seed", str(options.first_seed)),
-        *("--ppo.num-steps", str(options.steps), "--evaluation.number", "20"),
+        *(("--ppo.num-steps", str(options.steps)) if options.steps is not None else ()),
+        *("--evaluation.number", "20"),
         *("--jobs", str(options.jobs), "--name", name),
         *settings,
     ]

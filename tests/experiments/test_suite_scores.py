@@ -168,3 +168,14 @@ def test_pictures_are_drawn(tmp_path):
         suite_pictures.draw_tasks(tmp_path / "a.png", tasks, suite_scores.references(), across)
     suite_pictures.draw_together(tmp_path / "b.png", tasks)
     assert (tmp_path / "a.png").stat().st_size > 5000 < (tmp_path / "b.png").stat().st_size
+
+
+@pytest.mark.parametrize(("asked", "given"), [([], None), (["--steps", "8192"], "8192")])
+def test_without_steps_each_experiment_keeps_its_own(asked, given, monkeypatch, tmp_path):
+    sweeps = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(suite_benchmark, "sweep", lambda w: sweeps.append(w) or INTERRUPTED)
+    suite_benchmark.main(["humanoid-walk", *asked])
+    (words,) = sweeps
+    steps = words[words.index("--ppo.num-steps") + 1] if "--ppo.num-steps" in words else None
+    assert steps == given
