@@ -1,4 +1,4 @@
-"""The control suite's humanoids: those of `suite`, with more environments and a wider network.
+"""The control suite's humanoids, for a GPU: more environments than `suite`, a wider network.
 
 python -m purerl.run suite_humanoid --env.task humanoid-stand --engine warp --num-seeds 5
 

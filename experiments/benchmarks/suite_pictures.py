@@ -79,10 +79,11 @@ def draw_together(path: Path, tasks: dict[str, list[Seed]]) -> None:
     """Writes a picture of all tasks: IQM over steps, and the performance profile at the end."""
     pyplot = plotter()
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
-    steps, band = together(tasks)
-    left.plot(steps, band.iqm, color="C0", linewidth=2)
-    if band.low is not None:
-        left.fill_between(steps, band.low, band.high, color="C0", alpha=0.2, linewidth=0)
+    if (found := together(tasks)) is not None:
+        steps, band = found
+        left.plot(steps, band.iqm, color="C0", linewidth=2)
+        if band.low is not None:
+            left.fill_between(steps, band.low, band.high, color="C0", alpha=0.2, linewidth=0)
     left.xaxis.set_major_formatter(_in_millions)
     left.set(xlabel="control steps", ylabel="return", title=f"IQM of {len(tasks)} tasks")
     share, low, high = profile(tasks)
@@ -95,15 +96,27 @@ def draw_together(path: Path, tasks: dict[str, list[Seed]]) -> None:
     pyplot.close(figure)
 
 
-def together(tasks: dict[str, list[Seed]]) -> tuple[list[int], bootstrap.Band]:
-    """Returns the steps at which all seeds of all tasks were evaluated, and the IQM there."""
-    everyone = [s for seeds in tasks.values() for s in seeds]
-    steps = sorted(set.intersection(*(set(s.steps) for s in everyone)))
-    values = [
-        np.array([[s.returns[s.steps.index(n)] for n in steps] for s in seeds])
-        for seeds in tasks.values()
-    ]
+def together(tasks: dict[str, list[Seed]]) -> tuple[list[int], bootstrap.Band] | None:
+    """Returns the steps that every curve has, and the IQM there; None: there are none.
+
+    Other numbers of steps or environments are evaluated at other steps, so a curve is a line from
+    one evaluation to the next. A seed that failed keeps its last return, as in its score.
+    """
+    curves = [s for seeds in tasks.values() for s in seeds if s.status != "failed" and s.steps]
+    if not curves:
+        return None
+    first, last = max(s.steps[0] for s in curves), min(s.steps[-1] for s in curves)
+    steps = sorted({n for s in curves for n in s.steps if first <= n <= last})
+    if not steps:
+        return None
+    values = [np.array([_returns_at(steps, s) for s in seeds]) for seeds in tasks.values()]
     return steps, bootstrap.curve_band(values, number=500)
+
+
+def _returns_at(steps: Sequence[int], seed: Seed) -> np.ndarray:
+    if not seed.steps:
+        return np.zeros(len(steps))
+    return np.interp(steps, seed.steps, seed.returns)
 
 
 def summary(tasks: dict[str, list[Seed]]) -> str:

@@ -122,6 +122,22 @@ def test_curves_are_where_all_seeds_were_evaluated(tmp_path):
     assert suite_pictures.together({"a": longer, "b": [seed(1, 7.0)]})[0] == [10]
 
 
+def test_all_tasks_together_have_a_curve_though_evaluated_at_other_steps(tmp_path):
+    """A humanoid of 50 M steps beside a cheetah of 10 M; what never began counts as 0."""
+    cheetahs = [Seed("cheetah-run", 1, "done", (10, 20), (0.0, 100.0), (1.0, 2.0))]
+    humanoids = [Seed("humanoid-run", 1, "done", (15, 45), (30.0, 90.0), (1.0, 2.0))]
+    steps, band = suite_pictures.together({"a": cheetahs, "b": humanoids})
+    assert steps == [15, 20]
+    np.testing.assert_allclose(band.iqm, [(50 + 30) / 2, (100 + 40) / 2])
+    never = [Seed("hopper-hop", 1, "failed", (), (), ())]
+    _, band = suite_pictures.together({"a": cheetahs, "c": never})
+    np.testing.assert_allclose(band.iqm, [0.0, 50.0])
+    late = [Seed("hopper-hop", 1, "done", (30,), (1.0,), (1.0,))]
+    assert suite_pictures.together({"a": cheetahs, "b": late}) is None
+    suite_pictures.draw_together(tmp_path / "c.png", {"a": cheetahs, "b": late})
+    assert (tmp_path / "c.png").stat().st_size > 0
+
+
 def test_every_published_task_has_our_name():
     published = suite_scores.references()
     assert len(published) == 25
