@@ -1,9 +1,9 @@
-"""The control suite's humanoids, for a GPU: more environments than `suite`, a wider network.
+"""The control suite's humanoids, for a GPU: more environments, and a wider network.
 
 python -m purerl.run suite_humanoid --env.task humanoid-stand --engine warp --num-seeds 5
 
 Expected, of 1000, with five seeds in 10.5 min on one H200: humanoid-stand 963, humanoid-walk 889,
-humanoid-run 332. It gets up within 2 s. For a GPU: on a CPU core one seed takes hours.
+humanoid-run 332. It gets up within 2 s. On a CPU core one seed takes hours.
 """
 
 import dataclasses
