@@ -34,7 +34,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("tasks", nargs="*", help="which tasks; all by default")
-    parser.add_argument("--steps", type=int, help="control steps of each run; the experiment's own")
+    parser.add_argument(
+        "--steps", type=int, help="control steps of each run; by default the experiment's own"
+    )
     parser.add_argument("--seeds", type=int, default=5, help="seeds of each task")
     parser.add_argument("--first-seed", type=int, default=20, help="others than those chosen on")
     parser.add_argument("--jobs", type=int, default=0, help="processes at once; 0: by the machine")
