@@ -57,11 +57,8 @@ def _draw_task(panel: Any, seeds: Sequence[Seed], published: dict[str, float], a
         panel.plot(getattr(s, across), s.returns, color="C0", linewidth=0.5, alpha=0.4)
     found = common_curve(seeds)
     if found is not None:
-        steps, (iqm, low, high), seconds = found
-        x = steps if across == "steps" else seconds
-        panel.plot(x, iqm, color="C0", linewidth=2, label="purerl")
-        if low is not None:
-            panel.fill_between(x, low, high, color="C0", alpha=0.2, linewidth=0)
+        steps, band, seconds = found
+        _draw_band(panel, steps if across == "steps" else seconds, band)
     for column, (label, color) in LINES.items():
         if column in published:
             panel.axhline(published[column], color=color, linewidth=1, linestyle="--", label=label)
@@ -69,6 +66,12 @@ def _draw_task(panel: Any, seeds: Sequence[Seed], published: dict[str, float], a
     if across == "steps":
         panel.xaxis.set_major_formatter(_in_millions)
     panel.grid(alpha=0.3)
+
+
+def _draw_band(panel: Any, x: Sequence[float] | np.ndarray, band: bootstrap.Band) -> None:
+    panel.plot(x, band.iqm, color="C0", linewidth=2, label="purerl")
+    if band.low is not None:
+        panel.fill_between(x, band.low, band.high, color="C0", alpha=0.2, linewidth=0)
 
 
 def _in_millions(steps: float, _: int) -> str:
@@ -80,10 +83,7 @@ def draw_together(path: Path, tasks: dict[str, list[Seed]]) -> None:
     pyplot = plotter()
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
     if (found := together(tasks)) is not None:
-        steps, band = found
-        left.plot(steps, band.iqm, color="C0", linewidth=2)
-        if band.low is not None:
-            left.fill_between(steps, band.low, band.high, color="C0", alpha=0.2, linewidth=0)
+        _draw_band(left, *found)
     left.xaxis.set_major_formatter(_in_millions)
     left.set(xlabel="control steps", ylabel="return", title=f"IQM of {len(tasks)} tasks")
     share, low, high = profile(tasks)
