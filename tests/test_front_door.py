@@ -151,6 +151,6 @@ def test_the_list_of_experiments_is_what_a_newcomer_wants_to_see():
     names = [name for name, path in available().items() if path.parent == ROOT / "experiments"]
     assert names == [
         "cartpole_swingup", "ant_run", "ant_gaps", "rodent_run", "rodent_gaps", "suite",
-        "suite_humanoid", "custom_network",
+        "suite_gpu", "suite_humanoid", "custom_network",
     ]  # fmt: skip
     assert all(len(summary(available()[name])) < 90 for name in names)

@@ -2,6 +2,7 @@
 
     python -m experiments.benchmarks.suite_benchmark                       # every task: hours
     python -m experiments.benchmarks.suite_benchmark cheetah-run hopper-hop --steps 3000000
+    python -m experiments.benchmarks.suite_benchmark --gpu --engine warp   # settings for a GPU
     python -m experiments.benchmarks.suite_benchmark --scores mine.csv runs/suite  # no training
 
 Other words are settings, as `python -m purerl.run suite --help` lists them. All seeds of a task
@@ -37,6 +38,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--steps", type=int, help="control steps of each run; by default the experiment's own"
     )
+    parser.add_argument(
+        "--gpu",
+        action="store_true",
+        help="train with suite_gpu instead of suite; not the humanoids",
+    )
     parser.add_argument("--seeds", type=int, default=5, help="seeds of each task")
     parser.add_argument("--first-seed", type=int, default=20, help="others than those chosen on")
     parser.add_argument("--jobs", type=int, default=0, help="processes at once; 0: by the machine")
@@ -63,7 +69,7 @@ def train(options: argparse.Namespace, settings: Sequence[str]) -> int:
     """Carries out a sweep for each experiment that has some of the tasks, and scores all runs."""
     folders: list[Path] = []
     code = SUCCESS
-    for experiment, tasks in by_experiment(options.tasks or TASKS).items():
+    for experiment, tasks in by_experiment(options.tasks or TASKS, options.gpu).items():
         name = options.name + experiment.removeprefix("suite")
         last = sweep(words(options, experiment, tasks, name, settings))
         if last == USAGE:
@@ -79,11 +85,12 @@ def train(options: argparse.Namespace, settings: Sequence[str]) -> int:
     return code
 
 
-def by_experiment(tasks: Iterable[str]) -> dict[str, list[str]]:
+def by_experiment(tasks: Iterable[str], gpu: bool) -> dict[str, list[str]]:
     """Returns experiment -> those of the tasks that are trained with its settings."""
     found: dict[str, list[str]] = {}
     for task in tasks:
-        name = "suite_humanoid" if task.startswith("humanoid-") else "suite"
+        name = "suite_gpu" if gpu else "suite"
+        name = "suite_humanoid" if task.startswith("humanoid-") else name
         found.setdefault(name, []).append(task)
     return found
 

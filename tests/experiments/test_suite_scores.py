@@ -177,6 +177,20 @@ def test_humanoids_are_a_sweep_of_their_own(codes, ends_with, monkeypatch, tmp_p
     assert all(words[-2:] == ["--ppo.gamma", "0.9"] for words in sweeps)
 
 
+def test_for_a_gpu_all_but_the_humanoids_are_trained_with_its_settings(monkeypatch, tmp_path):
+    sweeps = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(suite_benchmark, "sweep", lambda w: sweeps.append(w) or INTERRUPTED)
+    suite_benchmark.main(["cheetah-run", "--gpu", "--name", "mine"])
+    suite_benchmark.main(["humanoid-run", "--gpu", "--name", "mine"])
+    begun = [(words[0], words[2], words[words.index("--name") + 1]) for words in sweeps]
+    assert begun == [
+        ("suite_gpu", "env.task=cheetah-run", "mine_gpu"),
+        ("suite_humanoid", "env.task=humanoid-run", "mine_humanoid"),
+    ]
+    assert all("--gpu" not in words for words in sweeps)
+
+
 @pytest.mark.slow
 def test_pictures_are_drawn(tmp_path):
     tasks = suite_scores.by_task([s for s in SEEDS if s.task == "cheetah-run"])
