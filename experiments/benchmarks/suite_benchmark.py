@@ -87,10 +87,10 @@ def train(options: argparse.Namespace, settings: Sequence[str]) -> int:
 
 def by_experiment(tasks: Iterable[str], gpu: bool) -> dict[str, list[str]]:
     """Returns experiment -> those of the tasks that are trained with its settings."""
+    others = "suite_gpu" if gpu else "suite"
     found: dict[str, list[str]] = {}
     for task in tasks:
-        name = "suite_gpu" if gpu else "suite"
-        name = "suite_humanoid" if task.startswith("humanoid-") else name
+        name = "suite_humanoid" if task.startswith("humanoid-") else others
         found.setdefault(name, []).append(task)
     return found
 
