@@ -68,6 +68,7 @@ def test_the_command_has_one_thread_before_jax_begins(tmp_path):
         "sys.argv[0] = 'run'; runpy.run_module('purerl.run', run_name='__main__')"
     )
     words = ["ant_run", "--engine", "jax", "--ppo.num-steps", "16384", "--evaluation.number", "0"]
+    words += ["--ppo.num-envs", "256", "--ppo.rollout-length", "32", "--ppo.num-minibatches", "8"]
     env = {name: value for name, value in os.environ.items() if name not in ("NPROC", "XLA_FLAGS")}
     done = subprocess.run(
         [sys.executable, "-c", script, *words, "--runs", str(tmp_path), "--name", "one"],

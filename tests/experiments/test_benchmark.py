@@ -126,8 +126,8 @@ def test_a_run_that_ends_before_its_update_is_an_error(tmp_path):
         )
 
 
-def test_scaling_changes_one_axis_and_keeps_minibatches(monkeypatch):
-    config = find("ant_run").ppo
+def test_scaling_changes_one_axis_and_keeps_minibatches():
+    config = dataclasses.replace(find("ant_run").ppo, num_envs=256, rollout_length=32)
 
     def sizes(axis, value):
         words = scaling.overrides(axis, value, config, 1024)
