@@ -230,8 +230,8 @@ def test_a_beginning_has_the_same_bits_however_it_is_compiled(num_shards):
 @pytest.mark.slow
 def test_with_xla_on_one_thread_the_cores_do_not_matter(tmp_path):
     """MuJoCo's threads change no bits; the size of XLA's own pool does, for this ant."""
-    words = ["ant_run", "--engine", "c", "--ppo.num-envs", "64", "--ppo.num-steps", "4096"]
-    words += ["--evaluation.number", "0", "--runs", str(tmp_path)]
+    words = ["ant_run", "--engine", "c", "--ppo.num-envs", "64", "--ppo.rollout-length", "32"]
+    words += ["--ppo.num-steps", "4096", "--evaluation.number", "0", "--runs", str(tmp_path)]
     own = sorted(os.sched_getaffinity(0))
     try:
         for number in {1, len(own)}:
