@@ -12,10 +12,15 @@ experiment = Experiment(
     build_env=cartpole_swingup.build,
     env=cartpole_swingup.Options(),
     build_network=networks.mlp,
-    network=networks.MlpOptions(policy_hidden=(64, 64), value_hidden=(64, 64), activation="tanh"),
-    ppo=Config(
+    network=networks.MlpOptions(
+        policy_hidden=(64, 64),
+        value_hidden=(64, 64),
+        activation="tanh",
+        initial_std=0.6,
+        min_std=1e-3,
+    ),
+    ppo=Config.plain(  # what `Config` has beyond this brings nothing here
         num_steps=1_000_000,
-        num_envs=64,
         rollout_length=64,
         num_minibatches=8,
         learning_rate=1e-3,

@@ -51,5 +51,5 @@ experiment = Experiment(
     env=cartpole_swingup.Options(),
     build_network=build_network,
     network=Options(),
-    ppo=Config(num_steps=400_000, num_envs=64, rollout_length=64, learning_rate=1e-3),
+    ppo=Config(num_steps=1_000_000),
 )

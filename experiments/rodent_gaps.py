@@ -33,9 +33,13 @@ experiment = Experiment(
     build_network=networks.mlp,
     # A scale that depends on what it feels lets it run with noise and step across without.
     network=networks.MlpOptions(
-        policy_hidden=(256, 256), value_hidden=(256, 256), std="state", initial_std=0.3
+        policy_hidden=(256, 256),
+        value_hidden=(256, 256),
+        std="state",
+        initial_std=0.3,
+        min_std=1e-3,
     ),
-    ppo=Config(
+    ppo=Config.plain(
         num_steps=32_000_000,
         num_envs=512,
         rollout_length=16,

@@ -100,7 +100,7 @@ def resize(sizes: Published, num_envs: int) -> Published:
 
 def our_experiment(body: str, physics: str, sizes: Published, num_steps: int) -> Experiment:
     """Returns brax's settings under our names."""
-    config = Config(
+    config = Config.plain(
         num_steps=num_steps,
         num_envs=sizes.num_envs,
         # brax takes several unrolls of each environment in turn, to fill its minibatches.
@@ -116,7 +116,13 @@ def our_experiment(body: str, physics: str, sizes: Published, num_steps: int) ->
         reward_scale=sizes.reward_scaling,
     )
     options: Any = brax_env.Options(name=body, backend=physics)  # type: ignore[arg-type]
-    network = networks.MlpOptions(policy_hidden=sizes.policy, value_hidden=sizes.value, std="state")
+    network = networks.MlpOptions(
+        policy_hidden=sizes.policy,
+        value_hidden=sizes.value,
+        std="state",
+        initial_std=0.6,
+        min_std=1e-3,
+    )
     return Experiment(brax_env.build, options, networks.mlp, network, config, engine="jax")
 
 

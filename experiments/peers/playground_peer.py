@@ -1,4 +1,4 @@
-"""Playground's CartpoleSwingup in our trainer, with the suite's settings.
+"""Playground's CartpoleSwingup in our trainer, with plain PPO.
 
 python -m purerl.run experiments/peers/playground_peer.py --num-seeds 3 --seed 0
 
@@ -11,12 +11,12 @@ experiment = Experiment(
     build_env=adapters.from_playground,
     env=adapters.PlaygroundOptions("CartpoleSwingup"),
     build_network=networks.mlp,
-    network=networks.MlpOptions(policy_hidden=(128, 128), value_hidden=(128, 128)),
-    ppo=Config(
+    network=networks.MlpOptions(initial_std=0.6, min_std=1e-3),
+    ppo=Config.plain(
         num_steps=5_000_000,
         num_envs=128,
         rollout_length=64,
-        learning_rate=1e-3,
+        num_minibatches=8,
         schedule="linear",
         reward_scale=0.1,
     ),

@@ -57,8 +57,7 @@ def make_batch(
 ) -> Batch:
     """Computes advantages and value targets of a rollout, [T, B].
 
-    `state` is the one after it, `last_value` [B] that of its observation, `first` [B] opens the
-    rollout.
+    `state` is the one after it, `last_value` [B] that of its observation, `first` [B] opens it.
     """
     advantage = estimate(config, state, transitions, last_value)
     return Batch(

@@ -1,28 +1,28 @@
 """The settings of PPO and of its evaluation: pure data, checked when made."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from purerl.ppo import checks
 
 
 @dataclass(frozen=True)
 class Config:
-    """PPO hyperparameters; sizes in the alphabet of `core/records.py`."""
+    """PPO hyperparameters, by default the control suite's; sizes as in `core/records.py`."""
 
     num_steps: int
     """Control steps of the whole run, all environments together; never exceeded."""
-    num_envs: int = 256
+    num_envs: int = 64
     """Environments that run in parallel, B."""
-    rollout_length: int = 32
-    """Control steps of each environment in one update, T."""
+    rollout_length: int = 128
+    """Control steps of each environment in one update, T; no push of colored noise lasts longer."""
     num_epochs: int = 4
     """Passes over each rollout."""
-    num_minibatches: int = 8
+    num_minibatches: int = 16
     """Gradient steps in one pass."""
     episode_length: int = 1000
     """Time limit of an episode [control steps]; reaching it truncates."""
-    shortest_episode: int = 0
+    shortest_episode: int = 32  # where the goal is reached soon, a start is what is to be learned
     """Time limit of the first environment's training episodes [control steps]; the others' rise
     to `episode_length`, evenly in their logarithm. 0, or not below that: all are that long."""
     gamma: float = 0.99
@@ -31,27 +31,27 @@ class Config:
     """Decay of the advantage trace, lambda."""
     clip: float = 0.2
     """Range of the policy ratio, 1 +- clip."""
-    advantage_clip: float = 0.0
+    advantage_clip: float = 4.0  # one fall of a pole that always stood undid a policy
     """Range of the normalized advantage, +- so many standard deviations; 0: any."""
-    min_advantage_std: float = 0.0
+    min_advantage_std: float = 0.01  # a policy that has earned nothing yet follows noise
     """Least deviation that advantages are divided by [scaled reward]; 0: any, however small."""
-    noise_color: float = 0.0
+    noise_color: float = 0.75  # with white noise, three of five hanging poles never swung up
     """Exponent b of the action noise, of power 1 / f^b: 0 white, 1 pink, whose pushes last."""
     value_weight: float = 0.5
     """Weight of the value loss."""
-    entropy_weight: float = 0.0
-    """Weight of the entropy bonus."""
-    entropy_target: float = 1.0
+    entropy_weight: float = 0.01
+    """Weight of the entropy bonus; 0.001 for a humanoid of 21 actions, 0 for a rodent of 38."""
+    entropy_target: float = 0.3  # beyond it, a bonus only holds a hopper down
     """Entropy up to which the bonus counts [nats for each action]; a uniform policy has 0.69."""
     max_gradient_norm: float = 1.0
     """Gradients are scaled down to this global norm."""
-    learning_rate: float = 3e-4
+    learning_rate: float = 1e-3
     """Adam's step size, or where it starts."""
-    schedule: Literal["constant", "linear", "adaptive_kl"] = "constant"
+    schedule: Literal["constant", "linear", "adaptive_kl"] = "linear"
     """Learning rate over the run: constant, linearly to 0, or steered by the policy's KL."""
     desired_kl: float = 0.01
     """KL of one minibatch step that the adaptive schedule aims at."""
-    reward_scaling: Literal["constant", "return_std"] = "constant"
+    reward_scaling: Literal["constant", "return_std"] = "return_std"
     """Divide rewards by nothing, or by the running std of the discounted return."""
     reward_scale: float = 1.0
     """Factor on every reward before learning; reported returns are unscaled."""
@@ -60,6 +60,14 @@ class Config:
         """Raises ValueError for a number outside its range or a budget below one update."""
         checks.check_rules(self, checks.TRAINING)
         checks.check_budget(self)
+
+    @classmethod
+    def plain(cls, **settings: Any) -> "Config":
+        """Returns PPO as other trainers have it: what they lack is off, unless in `settings`."""
+        off: dict[str, Any] = {"shortest_episode": 0, "advantage_clip": 0.0, "noise_color": 0.0}
+        off |= {"min_advantage_std": 0.0, "entropy_weight": 0.0, "entropy_target": 1.0}
+        off |= {"schedule": "constant", "reward_scaling": "constant"}
+        return cls(**(off | settings))
 
     @property
     def steps_per_update(self) -> int:

@@ -15,13 +15,11 @@ def optimizer(config: Config) -> optax.GradientTransformation:
 
 
 def scheduled_rate(config: Config, state: TrainState) -> Array:
-    """Returns the learning rate that this update starts with, []."""
-    if config.schedule == "constant":  # as set now, which a resumed run may have changed
-        return jnp.asarray(config.learning_rate, jnp.float32)
-    if config.schedule == "linear":
-        progress = state.update.astype(jnp.float32) / config.num_updates
-        return config.learning_rate * (1.0 - progress)
-    return state.learning_rate
+    """Returns the learning rate that this update starts with, []; a resumed run may set another."""
+    if config.schedule == "adaptive_kl":
+        return state.learning_rate
+    left = 1.0 - state.update.astype(jnp.float32) / config.num_updates
+    return jnp.float32(config.learning_rate) * (left if config.schedule == "linear" else 1.0)
 
 
 def next_rate(config: Config, rate: Array, kl: Array, sound: Array) -> Array:

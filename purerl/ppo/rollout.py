@@ -66,8 +66,7 @@ def is_lost(state: State) -> Array:
     """Tells, for one environment, whether any number of its state is NaN or absurd, [] bool."""
     parts = (state.physics, state.observation, state.reward, state.metrics, state.task)
     leaves = [x for x in jax.tree.leaves(parts) if jnp.issubdtype(x.dtype, jnp.floating)]
-    # A NaN fails every comparison.
-    sound = [jnp.all(jnp.abs(x) <= ABSURD) for x in leaves]
+    sound = [jnp.all(jnp.abs(x) <= ABSURD) for x in leaves]  # a NaN fails every comparison
     return ~jnp.all(jnp.stack(sound))
 
 
@@ -139,8 +138,7 @@ def truncation_values(
 
     def values() -> Array:
         output, _ = act(network, state, env, memory)
-        # `where` also drops the values of environments that are lost.
-        return jnp.where(truncated, output.value, 0.0)
+        return jnp.where(truncated, output.value, 0.0)  # drops those of lost environments, too
 
     return jax.lax.cond(truncated.any(), values, lambda: jnp.zeros(truncated.shape))
 

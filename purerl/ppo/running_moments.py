@@ -19,10 +19,8 @@ from flax import struct
 from purerl.core.parts import add_in_order
 from purerl.core.records import Array, Counter, PyTree, add_count, count_as_float, zero_count
 
-# A feature that never moved has variance 0; the floor keeps its first movement finite.
-VARIANCE_FLOOR = 1e-8
-# Beyond ten standard deviations a feature says "far" and no more: one outlier cannot dominate.
-CLIP = 10.0
+VARIANCE_FLOOR = 1e-8  # a feature that never moved has variance 0; its first movement stays finite
+CLIP = 10.0  # beyond ten standard deviations a feature says "far": one outlier cannot dominate
 
 
 class Compensated(struct.PyTreeNode):

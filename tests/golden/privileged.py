@@ -51,14 +51,17 @@ experiment = Experiment(
     build_env=build_env,
     env=cartpole_swingup.Options(),
     build_network=networks.mlp,
-    network=networks.MlpOptions(policy_hidden=(16,), value_hidden=(16,), std="state"),
-    ppo=Config(
+    network=networks.MlpOptions(
+        policy_hidden=(16,), value_hidden=(16,), std="state", initial_std=0.6, min_std=1e-3
+    ),
+    ppo=Config.plain(
         num_steps=768,
         num_envs=16,
         rollout_length=16,
         num_epochs=2,
         num_minibatches=4,
         episode_length=20,
+        learning_rate=3e-4,
         reward_scaling="return_std",
         schedule="linear",
     ),

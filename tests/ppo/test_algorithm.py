@@ -21,7 +21,7 @@ from tests.ppo.test_running_moments import update as merge_batch
 MLP = networks.MlpOptions(policy_hidden=(8,), value_hidden=(8,))
 GRU = networks.RecurrentOptions(hidden=8, encoder=(8,), value_hidden=(8,))
 LENGTH = 7
-CONFIG = algorithm.Config(
+CONFIG = algorithm.Config.plain(
     num_steps=6 * 16 * 100,
     num_envs=6,
     rollout_length=16,
@@ -505,6 +505,17 @@ def test_impossible_settings_are_refused(changes, words):
         dataclasses.replace(CONFIG, **changes)
     for word in words:
         assert word in str(error.value)
+
+
+def test_plain_ppo_lacks_what_other_trainers_lack_but_what_it_is_given():
+    off = {"shortest_episode": 0, "advantage_clip": 0.0, "min_advantage_std": 0.0}
+    off |= {"entropy_weight": 0.0, "entropy_target": 1.0, "reward_scaling": "constant"}
+    given = {"num_steps": 10**6, "noise_color": 1.0, "schedule": "linear"}
+    assert algorithm.Config.plain(**given) == algorithm.Config(**given, **off)
+    assert algorithm.Config.plain(num_steps=10**6).noise_color == 0.0
+    assert algorithm.Config.plain(num_steps=10**6).schedule == "constant"
+    with pytest.raises(TypeError, match="gama"):
+        algorithm.Config.plain(num_steps=10**6, gama=0.9)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from purerl.ppo.config import Config
 from purerl.ppo.distributions import given, normal_log_prob
 from purerl.ppo.noise import action_noise, coloring
 
-CONFIG = Config(num_steps=64 * 8, num_envs=8, rollout_length=64, num_minibatches=1)
+CONFIG = Config.plain(num_steps=64 * 8, num_envs=8, rollout_length=64, num_minibatches=1)
 PINK = dataclasses.replace(CONFIG, noise_color=1.0)
 
 

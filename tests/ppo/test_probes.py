@@ -12,7 +12,7 @@ from tests import quick
 from tests.ppo.probes import Probe
 
 SMALL = networks.MlpOptions(policy_hidden=(32,), value_hidden=(32,))
-CONFIG = algorithm.Config(
+CONFIG = algorithm.Config.plain(
     num_steps=64 * 16 * 60,
     num_envs=64,
     rollout_length=16,
@@ -111,7 +111,7 @@ def test_probe_fails_when_its_part_is_broken(name, monkeypatch):
 def memory_error(build, options):
     env = Probe("memory", steps=4)
     network = build(options, jnp.zeros(1), 1)
-    config = algorithm.Config(
+    config = algorithm.Config.plain(
         num_steps=128 * 16 * 120,
         num_envs=128,
         rollout_length=16,

@@ -456,10 +456,10 @@ def test_a_run_begun_under_other_conditions_lists_them(tmp_path, stop_after, cap
     facts["versions"]["jax"] = "0.0.1"
     file.write_text(json.dumps(facts))
     capsys.readouterr()
-    words = ["--resume", "--ppo.learning-rate", "1e-3"]
+    words = ["--resume", "--ppo.learning-rate", "3e-4"]
     said = refused(capsys, start(tmp_path, *words))
     assert "versions.jax: 0.0.1 -> " in said
-    assert "settings.ppo.learning_rate: 0.0003 -> 0.001" in said
+    assert "settings.ppo.learning_rate: 0.001 -> 0.0003" in said
     stop_after(10**9)
     assert start(tmp_path, *words, "--allow-changes") == SUCCESS
     allowed = json.loads(file.read_text())["allowed_changes"]
@@ -474,7 +474,7 @@ def test_a_copy_that_goes_on_otherwise_is_a_run_of_its_own(tmp_path):
     first = json.loads((folder(tmp_path) / "manifest.json").read_text())
     copy = folder(tmp_path).with_name("wide")
     shutil.copytree(folder(tmp_path), copy)
-    words = ["--name", "wide", "--resume", "--allow-changes", "--ppo.learning-rate", "1e-3"]
+    words = ["--name", "wide", "--resume", "--allow-changes", "--ppo.learning-rate", "3e-4"]
     for _ in range(2):  # and stays it
         assert start(tmp_path, *words) == SUCCESS
         second = json.loads((copy / "manifest.json").read_text())
