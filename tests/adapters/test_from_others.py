@@ -132,7 +132,10 @@ experiment = Experiment(
     env=Nothing(),
     build_network=networks.mlp,
     network=networks.MlpOptions(policy_hidden=(4,), value_hidden=(4,)),
-    ppo=Config(num_steps=64, num_envs=4, rollout_length=4, num_minibatches=2, episode_length=3),
+    ppo=Config(
+        num_steps=64, num_envs=4, rollout_length=4, num_minibatches=2, episode_length=3,
+        schedule="constant",  # a rate that falls depends on how far the whole run goes
+    ),
     evaluation=Evaluation(number=0),
 )
 """
