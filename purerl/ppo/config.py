@@ -1,4 +1,4 @@
-"""The settings of PPO and of its evaluation: pure data, checked when made."""
+"""The settings of PPO, by default the control suite's, and of its evaluation: checked data."""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -8,7 +8,7 @@ from purerl.ppo import checks
 
 @dataclass(frozen=True)
 class Config:
-    """PPO hyperparameters, by default the control suite's; sizes as in `core/records.py`."""
+    """PPO hyperparameters; sizes in the alphabet of `core/records.py`."""
 
     num_steps: int
     """Control steps of the whole run, all environments together; never exceeded."""
@@ -62,12 +62,12 @@ class Config:
         checks.check_budget(self)
 
     @classmethod
-    def plain(cls, **settings: Any) -> "Config":
+    def plain(cls, num_steps: int, **settings: Any) -> "Config":
         """Returns PPO as other trainers have it: what they lack is off, unless in `settings`."""
         off: dict[str, Any] = {"shortest_episode": 0, "advantage_clip": 0.0, "noise_color": 0.0}
         off |= {"min_advantage_std": 0.0, "entropy_weight": 0.0, "entropy_target": 1.0}
         off |= {"schedule": "constant", "reward_scaling": "constant"}
-        return cls(**(off | settings))
+        return cls(num_steps, **(off | settings))
 
     @property
     def steps_per_update(self) -> int:

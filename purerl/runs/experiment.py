@@ -23,7 +23,7 @@ import tyro
 from purerl.core.errors import UserError, one_line, unknown_name
 from purerl.ppo.config import Config, Evaluation
 from purerl.runs.files import read_bytes
-from purerl.runs.kinds import fits, hints, meant
+from purerl.runs.kinds import fits, hints, meant, wrong_choice
 from purerl.runs.options import Engine
 
 
@@ -164,6 +164,8 @@ def load(
     for field in ("env", "network", "ppo", "evaluation"):
         if not _has_settings(value := getattr(found, field)):
             raise UserError(f"{path}: {field} is {value!r}; it must be a frozen dataclass's value.")
+        if wrong := wrong_choice(value):
+            raise UserError(f"{path}: {field}.{wrong}")
         to_json(value, field)  # here, or the command line would meet what it cannot hold
     return Source(found, name or path.stem, path, text)
 

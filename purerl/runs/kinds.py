@@ -48,6 +48,18 @@ def fits(hint: Any, value: Any) -> bool:
     return not issubclass(origin, str | Path) or isinstance(value, str)
 
 
+def wrong_choice(record: Any) -> str:
+    """Returns which field of a dataclass is none of its few words, or "".
+
+    A `Literal` in Python is for readers and type checkers alone, and refuses nothing.
+    """
+    for name, hint in hints(type(record)).items():
+        words, value = get_args(hint), getattr(record, name, None)
+        if get_origin(hint) is Literal and value not in words:
+            return f"{name} is {value!r}; it must be {' or '.join(map(repr, words))}."
+    return ""
+
+
 def _all_fit(hints: Any, values: list) -> bool:
     return len(hints) == len(values) and all(map(fits, hints, values))
 

@@ -515,7 +515,7 @@ def test_plain_ppo_lacks_what_other_trainers_lack_but_what_it_is_given():
     assert algorithm.Config.plain(num_steps=10**6).noise_color == 0.0
     assert algorithm.Config.plain(num_steps=10**6).schedule == "constant"
     with pytest.raises(TypeError, match="gama"):
-        algorithm.Config.plain(num_steps=10**6, gama=0.9)
+        algorithm.Config.plain(10**6, gama=0.9)
 
 
 @pytest.mark.parametrize(
