@@ -2,9 +2,8 @@
 
 python -m purerl.run ant_gaps
 
-Expected: 15 gaps of 19, 5 or more in 93% of unseen corridors, after 4 min on two CPU cores (seeds 2
-and 3: 16 gaps, 90% and 100%). Ten seeds with MJX-Warp: 14.3 gaps at the lower quartile, 14.0 at
-least.
+Expected: 18 gaps of 19 in unseen corridors, after 6 min on two CPU cores. Ten seeds: 17.9 gaps
+at the lower quartile, 17.5 at least.
 """
 
 from envs import run
