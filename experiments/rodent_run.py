@@ -2,7 +2,8 @@
 
 python -m purerl.run rodent_run
 
-Expected: 2.4 m/s over 10 s episodes, head first, after 20 min on two CPU cores (seed 20: 1.8 m/s).
+Expected: 2.4 m/s over 10 s episodes, head first, after 20 min on two CPU cores. Ten seeds, on a
+GPU (engine `warp`, 22 min): 2.19 m/s at the lower quartile, 2.08 at least.
 """
 
 from envs import run
