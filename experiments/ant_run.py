@@ -14,6 +14,9 @@ experiment = Experiment(
     env=run.Options(body="ant"),
     build_network=networks.mlp,
     network=networks.MlpOptions(),
-    ppo=Config(num_steps=5_000_000),
+    ppo=Config(
+        num_steps=5_000_000,
+        entropy_weight=0.08,  # with the default and `warp`, three of ten seeds ran 4.3 m/s
+    ),
     evaluation=Evaluation(num_episodes=32, number=10),
 )

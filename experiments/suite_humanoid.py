@@ -1,4 +1,4 @@
-"""The control suite's humanoids, for a GPU: a lower rate and a smaller bonus.
+"""The control suite's humanoids, for a GPU: a lower rate.
 
 python -m purerl.run suite_humanoid --env.task humanoid-stand --engine warp --num-seeds 5
 
@@ -16,7 +16,6 @@ experiment = dataclasses.replace(
     env=tasks.Options(task="humanoid-walk"),
     ppo=dataclasses.replace(
         suite_gpu.experiment.ppo,
-        learning_rate=5e-4,  # a step in 21 actions goes further
-        entropy_weight=0.001,  # with 0.01, the bonus outweighs what one action of 21 can earn
+        learning_rate=5e-4,  # a step in 21 actions goes further: with 1e-3, one seed of five walked
     ),
 )

@@ -21,6 +21,7 @@ experiment = Experiment(
         num_minibatches=8,
         min_advantage_std=0.0,
         noise_color=0.0,
+        entropy_weight=0.08,
         entropy_target=1.0,
     ),
     evaluation=Evaluation(num_episodes=32, number=10),

@@ -76,6 +76,7 @@ BODIES = {
     "humanoid": Published(2048, 10, 1024, 32, 8, 0.97, 3e-4, 1e-3, 0.1),
     "halfcheetah": Published(2048, 20, 512, 32, 8, 0.95, 3e-4, 1e-3, 1.0),
 }
+ACTIONS = {"ant": 8, "humanoid": 17, "halfcheetah": 6}
 EPISODE_LENGTH = 1000
 NO_CLIPPING = 1e9  # of gradients: brax has none
 
@@ -110,7 +111,7 @@ def our_experiment(body: str, physics: str, sizes: Published, num_steps: int) ->
         episode_length=EPISODE_LENGTH,
         gamma=sizes.discounting,
         clip=0.3,
-        entropy_weight=sizes.entropy_cost,
+        entropy_weight=sizes.entropy_cost * ACTIONS[body],  # brax has a sum over the actions
         max_gradient_norm=NO_CLIPPING,
         learning_rate=sizes.learning_rate,
         reward_scale=sizes.reward_scaling,

@@ -39,8 +39,8 @@ class Config:
     """Exponent b of the action noise, of power 1 / f^b: 0 white, 1 pink, whose pushes last."""
     value_weight: float = 0.5
     """Weight of the value loss."""
-    entropy_weight: float = 0.01
-    """Weight of the entropy bonus; 0.001 for a humanoid of 21 actions, 0 for a rodent of 38."""
+    entropy_weight: float = 0.02
+    """Weight of the entropy bonus, a mean over the actions where other trainers have a sum."""
     entropy_target: float = 0.3  # beyond it, a bonus only holds a hopper down
     """Entropy up to which the bonus counts [nats for each action]; a uniform policy has 0.69."""
     max_gradient_norm: float = 1.0

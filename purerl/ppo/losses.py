@@ -36,9 +36,9 @@ def value_loss(value: Array, target: Array) -> Array:
 
 
 def bounded_entropy(entropy: Array, action_size: int, target: float) -> Array:
-    """Returns the entropy [nats], where it is at most `target` for each action, elementwise."""
-    greatest = target >= math.log(2.0)  # that of uniform actions in [-1, 1]
-    return entropy if greatest else jnp.minimum(entropy, target * action_size)
+    """Returns the mean entropy of an action [nats], at most `target`, elementwise."""
+    mean = entropy / action_size  # a sum would outweigh what one action of many can earn
+    return mean if target >= math.log(2.0) else jnp.minimum(mean, target)  # log 2: uniform actions
 
 
 def approximate_kl(log_ratio: Array) -> Array:

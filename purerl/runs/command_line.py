@@ -12,7 +12,7 @@ from typing import Any
 import tyro
 
 from purerl.core.errors import SUCCESS, RunError, UserError, nearest
-from purerl.runs import experiment, output
+from purerl.runs import experiment, others_words, output
 from purerl.runs.command_errors import tell
 from purerl.runs.experiment import Experiment, Source, available
 from purerl.runs.options import Options
@@ -135,11 +135,10 @@ def _one_line(text: str, names: list[str]) -> str:
     if unknown:
         if unknown[1] in ("True", "False"):
             return "A switch takes no value: give its option alone, or leave it out."
-        near = nearest(unknown[1], names)
-        if near == unknown[1]:  # a bool that is true: what turns it off is its only option
-            group, dot, name = near[2:].rpartition(".")
-            return f"{near} takes no value; --{group}{dot}no-{name} turns it off."
-        return f"There is no option {unknown[1]}." + (f" Did you mean {near}?" if near else "")
+        if unknown[1] in names:  # a bool that is true: what turns it off is its only option
+            group, dot, name = unknown[1][2:].rpartition(".")
+            return f"{unknown[1]} takes no value; --{group}{dot}no-{name} turns it off."
+        return f"There is no option {unknown[1]}. {others_words.meant(unknown[1], names)}".strip()
     titles = "Value error|Missing argument|Invalid choice|Parsing error|Required options"
     plain = re.sub(rf"^({titles}) ", "", plain)
     plain = re.sub(r" *(Argument helptext:|For full helptext).*", "", plain)

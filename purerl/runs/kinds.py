@@ -8,7 +8,7 @@ import typing
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
-from purerl.core.errors import nearest
+from purerl.runs import others_words
 
 
 def hints(kind: type) -> dict[str, Any]:
@@ -71,5 +71,5 @@ def meant(error: str, *kinds: type) -> str:
     if not found or found[1] not in known:
         return ""
     names = [field.name for field in known[found[1]]]
-    near = nearest(found[2], names)
-    return f"; did you mean {near}?" if near else f"; there are: {', '.join(names)}"
+    near = others_words.meant(found[2], names)
+    return f"; {near[0].lower()}{near[1:]}" if near else f"; there are: {', '.join(names)}"

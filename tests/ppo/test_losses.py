@@ -79,8 +79,8 @@ def test_advantages_far_below_their_least_deviation_stay_small(size, expected):
     np.testing.assert_allclose(normalized.std(), expected, rtol=0.05)
 
 
-@pytest.mark.parametrize("target, expected", [(0.3, [-1.0, 0.5, 0.6]), (1.0, [-1.0, 0.5, 1.3])])
-def test_an_entropy_counts_up_to_its_target_for_each_action(target, expected):
+@pytest.mark.parametrize("target, expected", [(0.3, [-0.5, 0.25, 0.3]), (1.0, [-0.5, 0.25, 0.65])])
+def test_the_entropy_of_an_action_counts_up_to_its_target(target, expected):
     bonus = losses.bounded_entropy(jnp.array([-1.0, 0.5, 1.3]), 2, target)
     np.testing.assert_allclose(bonus, expected, rtol=1e-6)
 

@@ -8,8 +8,8 @@ from typing import Annotated, Any, NamedTuple
 
 import tyro
 
-from purerl.core.errors import UserError, nearest, one_line
-from purerl.runs import experiment
+from purerl.core.errors import UserError, one_line
+from purerl.runs import experiment, others_words
 from purerl.runs.command_line import WORDS, parse
 from purerl.runs.experiment import Experiment
 from purerl.runs.kinds import hints
@@ -77,10 +77,10 @@ def setting(base: Base, name: str) -> Any:
         raise UserError("Each point is trained with several seeds already: give --seeds 3.")
     names = _names(base.chosen)
     if name not in names:
-        near = nearest(name, names)
-        hint = f" Did you mean {near}?" if near else ""
+        hint = others_words.meant(name, names)
+        said = f"There is no setting {name!r}." + (f" {hint}" if hint else "")
         page = f"python -m purerl.run {base.experiment} --help"
-        raise UserError(f"There is no setting {name!r}.{hint} All settings: {page}")
+        raise UserError(f"{said} All settings: {page}")
     return names[name]
 
 
