@@ -3,7 +3,7 @@
 python -m purerl.run suite_gpu --env.task walker-run --engine warp --num-seeds 5
 
 Expected, of 1000, with five seeds on an H200 beside others: walker-walk 984 in 15 min, hopper-stand
-963 in 6 min. After 100 M steps walker-run has 880 and cheetah-run 932. Others, and how they were
+963 in 6 min. After 100 M cheetah-run has 932, after 90 M walker-run 880. Others, and how they were
 trained: docs/measurements/suite.md. Humanoids: `suite_humanoid`.
 """
 

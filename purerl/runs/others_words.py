@@ -4,27 +4,29 @@ from collections.abc import Iterable
 
 from purerl.core.errors import nearest
 
+BONUS = "times the number of actions"
+# Their word -> ours, and how its value becomes ours where it is not the same.
 COUNTERPARTS = {
-    "anneal_lr": "schedule",
-    "clip_coef": "clip",
-    "clip_range": "clip",
-    "clipping_epsilon": "clip",
-    "discounting": "gamma",
-    "ent_coef": "entropy_weight",
-    "entropy_cost": "entropy_weight",
-    "entropy_coef": "entropy_weight",
-    "max_grad_norm": "max_gradient_norm",
-    "n_envs": "num_envs",
-    "n_epochs": "num_epochs",
-    "n_steps": "rollout_length",
-    "num_timesteps": "num_steps",
-    "num_updates_per_batch": "num_epochs",
-    "target_kl": "desired_kl",
-    "total_timesteps": "num_steps",
-    "unroll_length": "rollout_length",
-    "update_epochs": "num_epochs",
-    "vf_coef": "value_weight",
-    "vf_loss_coefficient": "value_weight",
+    "anneal_lr": ("schedule", "linear if true"),
+    "batch_size": ("num_minibatches", "num_envs * rollout_length / batch_size"),
+    "clip_coef": ("clip", ""),
+    "clip_range": ("clip", ""),
+    "clipping_epsilon": ("clip", ""),
+    "discounting": ("gamma", ""),
+    "ent_coef": ("entropy_weight", BONUS),
+    "entropy_coef": ("entropy_weight", BONUS),
+    "entropy_cost": ("entropy_weight", BONUS),
+    "max_grad_norm": ("max_gradient_norm", ""),
+    "minibatch_size": ("num_minibatches", "num_envs * rollout_length / minibatch_size"),
+    "n_envs": ("num_envs", ""),
+    "n_epochs": ("num_epochs", ""),
+    "n_steps": ("rollout_length", ""),
+    "num_timesteps": ("num_steps", ""),
+    "num_updates_per_batch": ("num_epochs", ""),
+    "total_timesteps": ("num_steps", ""),
+    "update_epochs": ("num_epochs", ""),
+    "vf_coef": ("value_weight", "times 2 if it is stable-baselines3's"),
+    "vf_loss_coefficient": ("value_weight", ""),
 }
 PAGE = "docs/tutorials/from_other_trainers.md"
 
@@ -32,16 +34,16 @@ PAGE = "docs/tutorials/from_other_trainers.md"
 def meant(name: str, valid: Iterable[str]) -> str:
     """Returns which setting a wrong name is surely meant to be, as a question, or "".
 
-    Another trainer's word is answered with ours and the page of both: their values may differ.
+    Another trainer's word is answered with ours, how to convert its value, and the page of both.
 
-    >>> meant("--ppo.ent-coef", ["--ppo.clip", "--ppo.entropy-weight"])
-    'Did you mean --ppo.entropy-weight (docs/tutorials/from_other_trainers.md)?'
+    >>> meant("--ppo.n-envs", ["--ppo.clip", "--ppo.num-envs"])
+    'Did you mean --ppo.num-envs (docs/tutorials/from_other_trainers.md)?'
     """
     valid = list(valid)
-    ours = COUNTERPARTS.get(_word(name), "")
+    ours, conversion = COUNTERPARTS.get(_word(name), ("", ""))
     for one in valid:
         if _word(one) == ours:
-            return f"Did you mean {one} ({PAGE})?"
+            return f"Did you mean {one} ({f'{conversion}; ' if conversion else ''}{PAGE})?"
     near = nearest(name, valid)
     return f"Did you mean {near}?" if near else ""
 
