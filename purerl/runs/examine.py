@@ -12,7 +12,7 @@ from purerl.core.records import PyTree
 from purerl.devices import memory
 from purerl.devices.programs import abstract_state, compile_programs
 from purerl.devices.shards import Shards
-from purerl.ppo.config import Evaluation
+from purerl.ppo.config import Config, Evaluation
 from purerl.ppo.learner import is_recurrent
 from purerl.runs import examine_env, examine_network
 from purerl.runs.build_experiment import Setup, blame, build
@@ -21,6 +21,7 @@ from purerl.runs.findings import Finding, error, ok, warning
 from purerl.runs.user_code import told
 
 FEW_SAMPLES = 32  # in a minibatch, whose gradient is then mostly noise
+FEW_UPDATES = 50  # of a run: with 48 a cart-pole had half of what smaller updates brought
 OBSERVATIONS = 256  # that a network is tried on, at most
 SHARE = 0.5  # of the memory: what the estimate leaves out may be as much again
 
@@ -41,7 +42,7 @@ def examine(chosen: Experiment, speed: bool) -> Iterator[Finding]:
         abstract = abstract_state(*setup[:3])
     yield ok("build", f"{type(setup.env).__name__}, engine {setup.engine}")
     found = [check_memory(setup, abstract), check_minibatch(setup, abstract)]
-    yield from found
+    yield from [*found, *check_settings(setup.config)]
     env_found = []
     for finding in examine_env.examine(setup.env):
         env_found.append(finding)
@@ -82,6 +83,17 @@ def check_minibatch(setup: Setup, abstract: PyTree) -> Finding:
         return warning("minibatches", f"{what}: lower ppo.num_minibatches.")
     whole = f", {config.num_envs // config.num_minibatches} whole rollouts" if recurrent else ""
     return ok("minibatches", what + whole)
+
+
+def check_settings(config: Config) -> Iterator[Finding]:
+    """Warns of a run that ends before it has learned, and of a setting that nothing reads."""
+    if config.num_updates < FEW_UPDATES:
+        what = f"{config.num_updates} in the whole run, of {config.steps_per_update:,} steps each"
+        yield warning("updates", f"{what}: lower ppo.rollout_length, or raise ppo.num_steps.")
+    fixed = config.schedule != "adaptive_kl"
+    if fixed and config.desired_kl != Config.desired_kl:
+        what = f"nothing reads {config.desired_kl} where ppo.schedule is {config.schedule!r}"
+        yield warning("desired_kl", f"{what}: set it to 'adaptive_kl', or leave it out.")
 
 
 def _starts(setup: Setup, number: int) -> State:

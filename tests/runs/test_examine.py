@@ -14,6 +14,7 @@ from purerl.core.records import Network, Normal, PolicyOutput
 from purerl.devices import memory
 from purerl.devices.programs import abstract_state
 from purerl.physics.interface import Physics
+from purerl.ppo.config import Config
 from purerl.ppo.networks import MlpOptions, RecurrentOptions, from_linen, mlp, recurrent
 from purerl.runs import examine, examine_env, examine_network
 from purerl.runs.build_experiment import build
@@ -155,6 +156,16 @@ def test_minibatches_of_few_samples_are_named(number, level):
     setup = build(dataclasses.replace(experiment, ppo=changed))
     found = examine.check_minibatch(setup, abstract_state(*setup[:3]))
     assert found.level == level and f"of {32 // number} steps each" in found.text
+
+
+def test_a_run_of_few_updates_and_a_setting_that_nothing_reads_are_named():
+    def said(**settings):
+        return bad(examine.check_settings(Config(num_envs=8, rollout_length=16, **settings)))
+
+    assert said(num_steps=50 * 128) == {}
+    assert "49 in the whole run, of 128 steps each" in said(num_steps=50 * 128 - 1)["updates"]
+    assert "reads 0.02 where" in said(num_steps=6400, desired_kl=0.02)["desired_kl"]
+    assert said(num_steps=6400, desired_kl=0.02, schedule="adaptive_kl") == {}
 
 
 def test_speed_is_measured_only_when_asked(monkeypatch):
