@@ -21,7 +21,7 @@ from purerl.runs.findings import Finding, error, ok, warning
 from purerl.runs.user_code import told
 
 FEW_SAMPLES = 32  # in a minibatch, whose gradient is then mostly noise
-FEW_UPDATES = 50  # of a run: with 48 a cart-pole had half of what smaller updates brought
+FEW_UPDATES = 50  # of a run: a cart-pole had 335 of 1000 after 48, and 901 after 122
 OBSERVATIONS = 256  # that a network is tried on, at most
 SHARE = 0.5  # of the memory: what the estimate leaves out may be as much again
 
@@ -93,7 +93,7 @@ def check_settings(config: Config) -> Iterator[Finding]:
     fixed = config.schedule != "adaptive_kl"
     if fixed and config.desired_kl != Config.desired_kl:
         what = f"nothing reads {config.desired_kl} where ppo.schedule is {config.schedule!r}"
-        yield warning("desired_kl", f"{what}: set it to 'adaptive_kl', or leave it out.")
+        yield warning("desired_kl", f"{what}: choose 'adaptive_kl', or leave desired_kl out.")
 
 
 def _starts(setup: Setup, number: int) -> State:

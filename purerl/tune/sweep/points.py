@@ -78,7 +78,7 @@ def setting(base: Base, name: str) -> Any:
     names = _names(base.chosen)
     if name not in names:
         hint = others_words.meant(name, names)
-        said = f"There is no setting {name!r}." + (f" {hint}" if hint else "")
+        said = f"There is no setting {name!r}. {hint}".strip()
         page = f"python -m purerl.run {base.experiment} --help"
         raise UserError(f"{said} All settings: {page}")
     return names[name]
