@@ -1,4 +1,4 @@
-"""What other trainers call our settings: those of brax, stable-baselines3 and CleanRL."""
+"""What brax, stable-baselines3, CleanRL, acme and rsl_rl call our settings."""
 
 from collections.abc import Iterable
 
@@ -10,21 +10,27 @@ COUNTERPARTS = {
     "anneal_lr": ("schedule", "linear if true"),
     "batch_size": ("num_minibatches", "num_envs * rollout_length / batch_size"),
     "clip_coef": ("clip", ""),
+    "clip_param": ("clip", ""),
     "clip_range": ("clip", ""),
     "clipping_epsilon": ("clip", ""),
+    "discount": ("gamma", ""),
     "discounting": ("gamma", ""),
     "ent_coef": ("entropy_weight", BONUS),
     "entropy_coef": ("entropy_weight", BONUS),
     "entropy_cost": ("entropy_weight", BONUS),
+    "lam": ("gae_lambda", ""),
     "max_grad_norm": ("max_gradient_norm", ""),
     "minibatch_size": ("num_minibatches", "num_envs * rollout_length / minibatch_size"),
     "n_envs": ("num_envs", ""),
     "n_epochs": ("num_epochs", ""),
     "n_steps": ("rollout_length", ""),
+    "num_steps_per_env": ("rollout_length", ""),
     "num_timesteps": ("num_steps", ""),
     "num_updates_per_batch": ("num_epochs", ""),
+    "ppo_clipping_epsilon": ("clip", ""),
     "total_timesteps": ("num_steps", ""),
     "update_epochs": ("num_epochs", ""),
+    "value_loss_coef": ("value_weight", "times 2"),
     "vf_coef": ("value_weight", "times 2 if it is stable-baselines3's"),
     "vf_loss_coefficient": ("value_weight", ""),
 }

@@ -1,0 +1,29 @@
+"""Another trainer's word is answered with our setting, which exists, and is on the page named."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from purerl import Config
+from purerl.runs import others_words
+
+OURS = [f"--ppo.{field.name.replace('_', '-')}" for field in dataclasses.fields(Config)]
+PAGE = Path(__file__).parents[2] / others_words.PAGE
+
+
+@pytest.mark.parametrize("theirs", others_words.COUNTERPARTS)
+def test_each_word_has_a_setting_and_is_on_the_page(theirs):
+    ours, conversion = others_words.COUNTERPARTS[theirs]
+    answer = others_words.meant(f"--ppo.{theirs.replace('_', '-')}", OURS)
+    assert answer.startswith(f"Did you mean --ppo.{ours.replace('_', '-')} (")
+    assert conversion in answer
+    assert f"`{theirs}`" in PAGE.read_text()
+
+
+@pytest.mark.parametrize(
+    ("theirs", "ours"),
+    [("discount", "gamma"), ("num-steps-per-env", "rollout-length"), ("lam", "gae-lambda")],
+)
+def test_words_that_look_like_another_setting_or_none(theirs, ours):
+    assert f"--ppo.{ours} " in others_words.meant(f"--ppo.{theirs}", OURS)
