@@ -30,8 +30,9 @@ def check_rules(settings: Any, rules: tuple) -> None:
     """Checks every setting by itself."""
     for rule, holds, names in rules:
         for name in names.split():
-            if not holds(getattr(settings, name)):
-                raise ValueError(f"{name} is {getattr(settings, name)}; it must be {rule}.")
+            value = getattr(settings, name)
+            if isinstance(value, str) or not holds(value):
+                raise ValueError(f"{name} is {value!r}; it must be {rule}.")
 
 
 def check_budget(config: Any) -> None:
@@ -58,9 +59,8 @@ def check_observation(observation: "PyTree") -> None:
         )
     for name, part in parts.items():
         if getattr(part, "ndim", None) != 1:
-            what = (
-                f"of shape {part.shape}" if hasattr(part, "shape") else f"a {type(part).__name__}"
-            )
+            shape, kind = getattr(part, "shape", None), type(part).__name__
+            what = f"a {kind}" if shape is None else f"of shape {shape}"
             raise ValueError(
                 f"The observation's part {name} is {what}; this network takes arrays [O]: flatten "
                 "it, or write a network of your own (experiments/custom_network.py)."

@@ -17,6 +17,7 @@ from purerl.ppo.config import Config
 from purerl.ppo.learner import is_recurrent
 from purerl.runs.check_env import check_fields, check_members, check_shapes, shapes_of_reset
 from purerl.runs.experiment import Experiment
+from purerl.runs.kinds import wrong_value
 from purerl.runs.user_code import check_takes, told
 
 
@@ -35,6 +36,8 @@ def build(chosen: Experiment) -> Setup:
     from purerl.physics.interface import choose_engine
 
     _check_precision()
+    if wrong := wrong_value(chosen):
+        raise UserError(f"The experiment's {wrong}")
     check_takes("build_env", chosen.build_env, "options", "engine")
     check_takes("build_network", chosen.build_network, "options", "observation", "action_size")
     threads.leave_one(chosen.engine)

@@ -12,6 +12,7 @@ import jax
 from purerl.core.records import PyTree
 from purerl.devices import threads
 from purerl.devices.memory import size
+from purerl.ppo.config import Config
 from purerl.runs import output
 from purerl.runs.build_experiment import Setup
 from purerl.runs.loggers import Record
@@ -19,7 +20,8 @@ from purerl.runs.loop import Plan
 
 SECONDS_BETWEEN_LINES = 2.0
 # Or one would think that it hangs.
-SLOW_BEGINNINGS = {"warp": "; its kernels, once on a machine, take a minute or more of an update"}
+SLOW_BEGINNING = "; its kernels, once on a machine, take a minute or more of an update"
+WARP_ON_CPU = "; on a CPU it is for tests only: take engine c"
 # Where NPROC says two, or JAX began before this run: else `threads.leave_one` has left one.
 STALLS = "; on two of XLA's threads its physics can stop for ever: set NPROC=1, or take engine c"
 
@@ -52,6 +54,7 @@ def describe_plan(
         "updates": f"{plan.updates:,} of {plan.steps_per_update:,} steps",
         "steps": f"{plan.steps:,}{rounded}",
         "evaluations": _ticks(plan.evaluations),
+        "episodes": _training_episodes(setup.config),
         "checkpoints": _ticks(plan.checkpoints),
         "metrics": f"a line every {plan.log_every} updates",
         "parameters": f"{parameters:,}",
@@ -67,8 +70,19 @@ def describe_plan(
 
 def engine_remark(engine: str, device: dict[str, Any]) -> str:
     """Returns what to know beforehand of an engine on a device, as in manifest.json."""
-    stalls = engine == "jax" and device.get("threads") == threads.STALLING  # a CPU's
-    return STALLS if stalls else SLOW_BEGINNINGS.get(engine, "")
+    if engine == "jax" and device.get("threads") == threads.STALLING:  # a CPU's
+        return STALLS
+    if engine == "warp":
+        return (WARP_ON_CPU if device["platform"] == "cpu" else "") + SLOW_BEGINNING
+    return ""
+
+
+def _training_episodes(config: Config) -> str:
+    """Returns how long training's episodes are, or "" where all are as long as an evaluation's."""
+    if not 0 < config.shortest_episode < config.episode_length:
+        return ""
+    lengths = f"{config.shortest_episode:,} to {config.episode_length:,} steps"
+    return f"{lengths} in training, so its return is below an evaluation's"
 
 
 def _ticks(updates: tuple[int, ...]) -> str:

@@ -23,7 +23,7 @@ import tyro
 from purerl.core.errors import UserError, one_line, unknown_name
 from purerl.ppo.config import Config, Evaluation
 from purerl.runs.files import read_bytes
-from purerl.runs.kinds import fits, hints, meant, wrong_choice
+from purerl.runs.kinds import fits, hints, meant, wrong_value
 from purerl.runs.options import Engine
 
 
@@ -121,6 +121,8 @@ def find_source(name: str) -> Source:
         spec = importlib.util.find_spec(name) if "." in name else None
     if spec is not None and str(spec.origin).endswith(".py"):
         return load(Path(str(spec.origin)))
+    if Path(name).exists():
+        raise UserError(f"{name} is no Python file; an experiment is one, such as mine.py.")
     places = f" in {' or '.join(map(str, _folders())) or 'sight'}"
     raise UserError(unknown_name("experiment", name, named, places))
 
@@ -164,9 +166,9 @@ def load(
     for field in ("env", "network", "ppo", "evaluation"):
         if not _has_settings(value := getattr(found, field)):
             raise UserError(f"{path}: {field} is {value!r}; it must be a frozen dataclass's value.")
-        if wrong := wrong_choice(value):
-            raise UserError(f"{path}: {field}.{wrong}")
         to_json(value, field)  # here, or the command line would meet what it cannot hold
+    if wrong := wrong_value(found):
+        raise UserError(f"{path}: {wrong}")
     return Source(found, name or path.stem, path, text)
 
 

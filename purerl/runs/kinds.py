@@ -2,6 +2,7 @@
 
 import dataclasses
 import enum
+import inspect
 import re
 import types
 import typing
@@ -48,16 +49,62 @@ def fits(hint: Any, value: Any) -> bool:
     return not issubclass(origin, str | Path) or isinstance(value, str)
 
 
-def wrong_choice(record: Any) -> str:
-    """Returns which field of a dataclass is none of its few words, or "".
+WORDS = {int: "a whole number", float: "a number", bool: "True or False", str: "a text"}
 
-    A `Literal` in Python is for readers and type checkers alone, and refuses nothing.
+
+def wrong_value(record: Any, path: str = "") -> str:
+    """Returns which field of a dataclass, or of one in it, is not of its annotated kind, or "".
+
+    Python checks no annotation, and 2.5 epochs or True environments would train.
+
+    >>> from purerl import Config
+    >>> wrong_value(Config(num_steps=10_000, num_epochs=2.5))
+    'num_epochs is 2.5; it must be a whole number.'
     """
     for name, hint in hints(type(record)).items():
-        words, value = get_args(hint), getattr(record, name, None)
-        if get_origin(hint) is Literal and value not in words:
-            return f"{name} is {value!r}; it must be {' or '.join(map(repr, words))}."
+        value, where = getattr(record, name, None), f"{path}{name}"
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            if wrong := wrong_value(value, f"{where}."):
+                return wrong
+        elif value is not None and not _is_a(hint, value):
+            return f"{where} is {value!r}; it must be {_in_words(hint)}."
     return ""
+
+
+def _in_words(hint: Any) -> str:
+    inner = get_args(hint)
+    if get_origin(hint) is Literal:
+        return " or ".join(map(repr, inner))
+    if get_origin(hint) is tuple and inner[1:] == (...,):
+        return f"a tuple, each part {_in_words(inner[0])}"
+    return WORDS.get(hint) or inspect.formatannotation(hint)
+
+
+def _is_a(hint: Any, value: Any) -> bool:
+    """Tells whether a setting in Python is of its annotated kind; True for kinds it does not know.
+
+    Stricter than `fits`: a whole number is no True, and no 2.0.
+    """
+    origin, inner = get_origin(hint) or hint, get_args(hint)
+    if origin in (Union, types.UnionType):
+        return any(_is_a(one, value) for one in inner)
+    if origin is Literal:
+        return value in inner
+    if origin in (tuple, list):
+        every = origin is list or inner[1:] == (...,)
+        wanted = inner[:1] * len(value) if every and isinstance(value, tuple | list) else inner
+        return isinstance(value, tuple | list) and (not inner or _all_are(wanted, value))
+    if origin is types.NoneType:
+        return value is None
+    if origin in (int, float):
+        return isinstance(value, origin | int) and not isinstance(value, bool)
+    if origin is bool:
+        return isinstance(value, bool) or value in (0, 1)
+    return origin is not str or isinstance(value, str)
+
+
+def _all_are(hints: Any, values: Any) -> bool:
+    return len(hints) == len(values) and all(map(_is_a, hints, values))
 
 
 def _all_fit(hints: Any, values: list) -> bool:

@@ -24,6 +24,7 @@ COUNTERPARTS = {
     "n_envs": ("num_envs", ""),
     "n_epochs": ("num_epochs", ""),
     "n_steps": ("rollout_length", ""),
+    "num_evals": ("number", "less 1 if it is brax's"),
     "num_steps_per_env": ("rollout_length", ""),
     "num_timesteps": ("num_steps", ""),
     "num_updates_per_batch": ("num_epochs", ""),

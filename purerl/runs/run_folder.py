@@ -2,7 +2,7 @@
 
 import contextlib
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,21 +36,22 @@ def refusals() -> Iterator[None]:
         raise UserError(f"{where} cannot be read or written: {error.strerror or error}.") from error
 
 
-def check_new_or_resume(folders: Iterable[Path], resume: bool) -> None:
+def check_new_or_resume(runs: Mapping[Path, Experiment], resume: bool) -> None:
     """Raises UserError if a new run would overwrite something, or there is nothing to resume.
 
     Args:
-      folders: one for each seed. Seeds that were killed while starting may have only some of them.
+      runs: each seed's folder, and its experiment. Seeds that were killed while starting may have
+        only some of the folders.
       resume: whether the runs are to go on.
     """
-    folders = list(folders)
+    folders = list(runs)
     if resume and not any(folder.exists() for folder in folders):
         raise UserError(f"There is no run {folders[0]} to resume; leave out --resume to start it.")
     for folder in folders:
         check_no_links(folder)
         is_run = (folder / "config.json").exists()
         if is_run and not resume and is_begun(folder):
-            raise UserError(f"The run {folder} exists; use --resume to go on, or another --name.")
+            raise UserError(f"The run {folder} exists{_how_to_begin(folder, runs[folder])}")
         strange = {path.name for path in folder.iterdir()} - OURS if folder.is_dir() else set()
         strange -= {draft_of(folder / name).name for name in OURS}  # of a run killed while starting
         if strange and not is_run:
@@ -61,6 +62,18 @@ def check_new_or_resume(folders: Iterable[Path], resume: bool) -> None:
                 f"{folder} holds checkpoints, but its config.json is gone, which says what they "
                 "are of. Bring it back from a copy, or use another --name."
             )
+
+
+def _how_to_begin(folder: Path, chosen: Experiment) -> str:
+    """Returns what to do where a run has the folder already; one of other settings cannot go on."""
+    there = read_json(folder / "config.json").get("settings", {})
+    unlike = manifest.differences(there, experiment.to_json(chosen))
+    if not unlike:
+        return "; use --resume to go on, or another --name."
+    if len(unlike) == 1 and unlike[0].startswith("ppo.num_steps"):
+        return f" ({unlike[0]}); to train longer, copy it first (docs/howto/go_on.md)."
+    more = f", and {len(unlike) - 1} more" if len(unlike) > 1 else ""
+    return f", with other settings ({unlike[0]}{more}); use another --name."
 
 
 def is_begun(folder: Path) -> bool:
@@ -153,6 +166,8 @@ def cure(found: list[str]) -> str:
         return "Put the file back that was edited"
     if any(line.startswith("vmapped_seeds") for line in found):
         return "Give the --num-seeds and --seed it was begun with"
+    if all(line.startswith(("source.", "experiment.py: ")) for line in found):
+        return "Put back what was edited"
     if any(line.startswith("settings.ppo.num_steps") for line in found):
         return "To train longer, copy the run first (docs/howto/go_on.md)"
     return "Give the command it was begun with"

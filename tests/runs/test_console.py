@@ -14,6 +14,7 @@ from purerl.runs.console import engine_remark
         ("jax", {"platform": "gpu"}, ""),
         ("c", {"platform": "cpu", "threads": 2}, ""),
         ("warp", {"platform": "gpu"}, "take a minute"),
+        ("warp", {"platform": "cpu", "threads": 1}, "for tests only: take engine c"),
     ],
 )
 def test_the_line_of_an_engine_tells_what_may_stop_or_take_long(engine, device, said):

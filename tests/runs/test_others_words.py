@@ -1,14 +1,19 @@
 """Another trainer's word is answered with our setting, which exists, and is on the page named."""
 
 import dataclasses
+import re
 from pathlib import Path
 
 import pytest
 
-from purerl import Config
+from purerl import Config, Evaluation
 from purerl.runs import others_words
 
-OURS = [f"--ppo.{field.name.replace('_', '-')}" for field in dataclasses.fields(Config)]
+OURS = [
+    f"--{group}.{field.name.replace('_', '-')}"
+    for group, kind in (("ppo", Config), ("evaluation", Evaluation))
+    for field in dataclasses.fields(kind)
+]
 PAGE = Path(__file__).parents[2] / others_words.PAGE
 
 
@@ -16,7 +21,7 @@ PAGE = Path(__file__).parents[2] / others_words.PAGE
 def test_each_word_has_a_setting_and_is_on_the_page(theirs):
     ours, conversion = others_words.COUNTERPARTS[theirs]
     answer = others_words.meant(f"--ppo.{theirs.replace('_', '-')}", OURS)
-    assert answer.startswith(f"Did you mean --ppo.{ours.replace('_', '-')} (")
+    assert re.match(rf"Did you mean --\w+\.{ours.replace('_', '-')} \(", answer)
     assert conversion in answer
     assert f"`{theirs}`" in PAGE.read_text()
 

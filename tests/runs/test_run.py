@@ -541,10 +541,10 @@ def test_a_disk_that_is_full_at_the_start_is_one_line(tmp_path, monkeypatch, cap
 
 def test_a_start_that_was_killed_half_way_can_be_made_again(tmp_path):
     (tmp_path / ".manifest.json.draft").touch()
-    run_folder.check_new_or_resume([tmp_path], resume=False)
+    run_folder.check_new_or_resume({tmp_path: find(str(TOY))}, resume=False)
     (tmp_path / "notes.txt").touch()
     with pytest.raises(errors.UserError, match=r"no run \(it holds notes.txt\)"):
-        run_folder.check_new_or_resume([tmp_path], resume=False)
+        run_folder.check_new_or_resume({tmp_path: find(str(TOY))}, resume=False)
 
 
 @pytest.mark.parametrize(

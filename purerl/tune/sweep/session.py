@@ -137,7 +137,7 @@ class _Progress:
             yield points.job(self.sweep.base, point)
 
     def began(self, job: Job) -> None:
-        say(f"{job.name}  begins   {self._values(job)}")
+        say(f"{job.name}  begins   {self._values(job)}  (progress: {job.log})")
 
     def ended(self, result: Ended) -> None:
         """Tells how a job ended; UserError if it is done and has no such metric."""

@@ -1,0 +1,88 @@
+"""Settings of the wrong kind, which Python itself does not notice, are refused by name."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import pytest
+
+from experiments import cartpole_swingup
+from purerl.core.errors import UserError
+from purerl.runs import build_experiment
+from purerl.runs.kinds import wrong_value
+
+EXPERIMENT = cartpole_swingup.experiment
+
+
+def changed(part, **settings):
+    return dataclasses.replace(
+        EXPERIMENT, **{part: dataclasses.replace(getattr(EXPERIMENT, part), **settings)}
+    )
+
+
+@pytest.mark.parametrize(
+    ("experiment", "told"),
+    [
+        (changed("ppo", num_epochs=2.5), "ppo.num_epochs is 2.5; it must be a whole number."),
+        (changed("ppo", num_envs=True), "ppo.num_envs is True; it must be a whole number."),
+        (changed("ppo", num_steps=1e5), "ppo.num_steps is 100000.0; it must be a whole number."),
+        (changed("evaluation", number=2.5), "evaluation.number is 2.5; it must be a whole number."),
+        (
+            changed("network", policy_hidden=64),
+            "network.policy_hidden is 64; it must be a tuple, each part a whole number.",
+        ),
+        (
+            changed("network", value_hidden=(64, 8.0)),
+            "network.value_hidden is (64, 8.0); it must be a tuple, each part a whole number.",
+        ),
+        (
+            changed("network", std="both"),
+            "network.std is 'both'; it must be 'learned' or 'state'.",
+        ),
+        (dataclasses.replace(EXPERIMENT, seed="2"), "seed is '2'; it must be a whole number."),
+    ],
+)
+def test_a_value_of_the_wrong_kind_is_told_and_never_trained(experiment, told):
+    assert wrong_value(experiment) == told
+    with pytest.raises(UserError, match="The experiment's "):
+        build_experiment.build(experiment)
+
+
+def test_a_text_for_a_number_is_told_by_its_setting():
+    with pytest.raises(ValueError, match="learning_rate is '3e-4'; it must be above 0"):
+        changed("ppo", learning_rate="3e-4")
+
+
+@dataclass(frozen=True)
+class Inner:
+    gaps: tuple[float, float] = (0.1, 0.2)
+
+
+@dataclass(frozen=True)
+class Options:
+    frequency: float = 4.0
+    limit: int | None = None
+    inner: Inner = Inner()
+    name: str = "one"
+    switch: bool = False
+
+
+@pytest.mark.parametrize(
+    "options",
+    [Options(frequency=4), Options(limit=3), Options(inner=Inner([1, 2])), Options(switch=True)],
+)
+def test_what_fits_passes(options):
+    assert wrong_value(options) == ""
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (Options(frequency="4"), "frequency is '4'; it must be a number."),
+        (Options(limit=3.5), "limit is 3.5; it must be int | None."),
+        (Options(inner=Inner((1.0,))), "inner.gaps is (1.0,); it must be tuple[float, float]."),
+        (Options(name=1), "name is 1; it must be a text."),
+        (Options(switch="no"), "switch is 'no'; it must be True or False."),
+    ],
+)
+def test_a_persons_own_settings_are_checked_too(options, named):
+    assert wrong_value(options) == named
