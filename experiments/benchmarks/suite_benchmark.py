@@ -17,6 +17,7 @@ import csv
 import itertools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from envs.suite.tasks import TASKS
 from experiments.benchmarks import suite_pictures, suite_scores
@@ -27,9 +28,17 @@ from purerl.runs.files import runs_in
 from purerl.sweep import main as sweep
 
 
+class Parser(argparse.ArgumentParser):
+    """Tells what is wrong in one line, as purerl's commands do."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raises UserError where argparse would print all options and exit."""
+        raise UserError(f"{message}. All options: {self.prog} --help")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code, which is that of the sweep."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="python -m experiments.benchmarks.suite_benchmark",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -47,7 +56,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--first-seed", type=int, default=20, help="others than those chosen on")
     parser.add_argument("--jobs", type=int, default=0, help="processes at once; 0: by the machine")
     parser.add_argument("--name", default="suite", help="of the sweep, a folder in sweeps/")
-    parser.add_argument("--out", type=Path, help="folder for tables and pictures; the sweep's own")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        help="folder for tables and pictures; the sweep's own, or here for --scores",
+    )
     parser.add_argument(
         "--scores",
         type=Path,
@@ -57,7 +70,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     options, settings = parser.parse_known_args(arguments)
     if options.scores is not None:
-        report(suite_scores.merged(map(given, options.scores)), options.out or Path("."))
+        sources = [given(place) for place in options.scores]
+        seeds = suite_scores.merged(sources)
+        if left_out := sum(map(len, sources)) - len(seeds):
+            print(f"left out, as another run of the task and seed is longer: {left_out}")
+        report(seeds, options.out or Path("."))
         return SUCCESS
     for task in options.tasks:
         if task not in TASKS:

@@ -26,6 +26,8 @@ VERSUS = [
 ]  # fmt: skip
 GROUPS_CSV = ["label", "n", "done", "failed", "unfinished", "iqm", "mean", "tenth", "worst"]
 GROUPS_CSV += ["worst_run", "low", "high"]
+MANY = 3  # files of source code that differ, beyond which they are counted
+LONGEST_LABEL = 60  # beside the other columns it fits a wide terminal
 CURVES_CSV = ["group", "n", "steps", "iqm", "low", "high"]
 
 
@@ -94,13 +96,19 @@ def describe(result: dict[str, Any]) -> list[str]:
         lines += [f"  {line}" for line in pair["lines"]]
     for name, values in result["settings_that_differ"].items():
         lines.append(f"differs: {name} is {' | '.join(map(str, values))}")
-    lines += [f"other conditions: {line}" for line in result["conditions_that_differ"]]
+    lines += [f"other conditions: {line}" for line in few(result["conditions_that_differ"])]
     if result["unscored"]:
         return [*lines, f"No scores: {result['unscored']}"]
     groups, versus = result["groups"], result["versus_first"]
-    lines += table(GROUPS, [g | {"worst_run": Path(g["worst_run"]).name} for g in groups])
+    short = short_names([g["label"] for g in groups])
+    lines += [f"group {name} is {label}" for label, name in short.items() if name != label]
+    named = [
+        g | {"worst_run": Path(g["worst_run"]).name, "label": short[g["label"]]} for g in groups
+    ]
+    lines += table(GROUPS, named)
     if versus:
-        lines += ["", f"against {versus[0]['baseline']}:", *table(VERSUS, versus)]
+        lines += ["", f"against {short[versus[0]['baseline']]}:"]
+        lines += table(VERSUS, [v | {"label": short[v["label"]]} for v in versus])
         if any(v["same_seeds"] for v in versus):
             lines.append(
                 "Paired: differences between runs of one seed, which begin with the same weights "
@@ -109,6 +117,25 @@ def describe(result: dict[str, Any]) -> list[str]:
     if result["pairs"]:
         lines.append("Runs of one configuration and seed count once, as the first of them.")
     return lines + notes(groups)
+
+
+def few(differences: Sequence[str]) -> list[str]:
+    """Returns lines of what differs: many files of source code as their number."""
+    files = [line for line in differences if line.startswith("source.")]
+    if len(files) <= MANY:
+        return list(differences)
+    return [line for line in differences if line not in files] + [f"source: {len(files)} files"]
+
+
+def short_names(labels: Sequence[str]) -> dict[str, str]:
+    """Returns label -> what a table calls the group: a number, where a label is too long for it.
+
+    >>> short_names(["ppo.gamma=0.9", "ppo.gamma=0.99"])
+    {'ppo.gamma=0.9': 'ppo.gamma=0.9', 'ppo.gamma=0.99': 'ppo.gamma=0.99'}
+    """
+    if max(map(len, labels), default=0) <= LONGEST_LABEL:
+        return {label: label for label in labels}
+    return {label: f"{i + 1}" for i, label in enumerate(labels)}
 
 
 def notes(summaries: Sequence[dict[str, Any]]) -> list[str]:

@@ -138,6 +138,8 @@ def _one_line(text: str, names: list[str]) -> str:
         if unknown[1] in names:  # a bool that is true: what turns it off is its only option
             group, dot, name = unknown[1][2:].rpartition(".")
             return f"{unknown[1]} takes no value; --{group}{dot}no-{name} turns it off."
+        if not unknown[1].startswith("-"):
+            return f"{unknown[1]!r} follows no option; write one before it, as in --name x."
         return f"There is no option {unknown[1]}. {others_words.meant(unknown[1], names)}".strip()
     titles = "Value error|Missing argument|Invalid choice|Parsing error|Required options"
     plain = re.sub(rf"^({titles}) ", "", plain)

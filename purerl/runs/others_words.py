@@ -51,7 +51,8 @@ def meant(name: str, valid: Iterable[str]) -> str:
     for one in valid:
         if _word(one) == ours:
             return f"Did you mean {one} ({f'{conversion}; ' if conversion else ''}{PAGE})?"
-    near = nearest(name, valid)
+    counts = (one for one in valid if _word(one) == f"num_{_word(name)}")  # seeds, of num_seeds
+    near = next(counts, "") or nearest(name, valid)
     return f"Did you mean {near}?" if near else ""
 
 

@@ -89,6 +89,22 @@ def test_of_a_seed_that_two_machines_have_the_longer_counts(tmp_path):
         assert suite_scores.merged(read) == [long, other]
 
 
+def test_runs_that_are_left_out_are_told(tmp_path, capsys):
+    short, long = seed(1, 5.0, status="unfinished"), seed(1, 5.0, 7.0)
+    for name, seeds in (("a.csv", [long, seed(2, 1.0)]), ("b.csv", [short])):
+        suite_scores.write_seeds(tmp_path / name, seeds)
+    places = [str(tmp_path / name) for name in ("a.csv", "b.csv")]
+    suite_benchmark.main(["--scores", *places, "--out", str(tmp_path)])
+    assert "another run of the task and seed is longer: 1" in capsys.readouterr().out
+    suite_benchmark.main(["--scores", places[0], "--out", str(tmp_path)])
+    assert "left out" not in capsys.readouterr().out
+
+
+def test_a_wrong_word_is_told_in_one_line():
+    with pytest.raises(UserError, match=r"^argument --seeds: invalid int value: 'two'\. All"):
+        suite_benchmark.main(["--seeds", "two"])
+
+
 def test_ahead_is_at_or_above():
     tasks = suite_scores.by_task(SEEDS)
     published = {"cheetah-run": {"x": 600.0, "y": 600.1}, "hopper-hop": {"x": 15.1}}

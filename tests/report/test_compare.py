@@ -201,6 +201,22 @@ def test_groups_can_be_chosen_and_what_is_left_aside_makes_strata(tmp_path):
 # --- the same run twice ---
 
 
+def test_long_names_of_groups_and_many_files_leave_the_table_readable(tmp_path, capsys):
+    sources = [{f"module_{i}": f"{name}{i}" for i in range(9)} for name in "ab"]
+    for name, source in zip("ab", sources, strict=True):
+        experiment = f"{name}_{'walks_and_trots_and_runs_' * 3}"
+        make_run(tmp_path / name, 1, [1.0] * UPDATES, experiment=experiment, source=source)
+    found(tmp_path, tmp_path / "a", tmp_path / "b")
+    said = capsys.readouterr().out.splitlines()
+    assert "other conditions: source: 9 files" in said
+    assert not [line for line in said if "module_" in line]
+    assert [line for line in said if line.startswith("group 2 is b_walks_and_trots")]
+    (head,) = (i for i, line in enumerate(said) if line.startswith("group  n"))
+    assert [line.split()[0] for line in said[head + 1 : head + 3]] == ["1", "2"]
+    assert max(map(len, said[head : head + 3])) < 100
+    assert "against 1:" in said
+
+
 def test_equal_digests_are_the_same_run_and_count_once(tmp_path, capsys):
     make_run(tmp_path / "runs" / "a", 1, [1.0] * 4, digests=["d1", "d2", "d3", "d4"])
     make_run(tmp_path / "runs" / "b", 1, [1.0] * 4, digests=["d1", "d2", "d3", "d4"])
