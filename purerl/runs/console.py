@@ -54,7 +54,7 @@ def describe_plan(
         "updates": f"{plan.updates:,} of {plan.steps_per_update:,} steps",
         "steps": f"{plan.steps:,}{rounded}",
         "evaluations": _ticks(plan.evaluations),
-        "episodes": _training_episodes(setup.config),
+        "episodes": training_episodes(setup.config),
         "checkpoints": _ticks(plan.checkpoints),
         "metrics": f"a line every {plan.log_every} updates",
         "parameters": f"{parameters:,}",
@@ -77,12 +77,12 @@ def engine_remark(engine: str, device: dict[str, Any]) -> str:
     return ""
 
 
-def _training_episodes(config: Config) -> str:
+def training_episodes(config: Config) -> str:
     """Returns how long training's episodes are, or "" where all are as long as an evaluation's."""
     if not 0 < config.shortest_episode < config.episode_length:
         return ""
     lengths = f"{config.shortest_episode:,} to {config.episode_length:,} steps"
-    return f"{lengths} in training, so its return is below an evaluation's"
+    return f"{lengths} in training, whole in evaluations: do not compare their returns"
 
 
 def _ticks(updates: tuple[int, ...]) -> str:

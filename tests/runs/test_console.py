@@ -2,7 +2,8 @@
 
 import pytest
 
-from purerl.runs.console import engine_remark
+from purerl.ppo.config import Config
+from purerl.runs.console import engine_remark, training_episodes
 
 
 @pytest.mark.parametrize(
@@ -21,3 +22,12 @@ def test_the_line_of_an_engine_tells_what_may_stop_or_take_long(engine, device, 
     """Engine jax on two of XLA's threads waited for ever; on one, three and four it did not."""
     remark = engine_remark(engine, device)
     assert (said in remark) if said else remark == ""
+
+
+@pytest.mark.parametrize(
+    ("shortest", "said"), [(0, ""), (32, "32 to 1,000 steps in training"), (1000, "")]
+)
+def test_training_episodes_of_many_lengths_are_told(shortest, said):
+    """Else the return on the screen, of short episodes, looks broken beside an evaluation's."""
+    line = training_episodes(Config(num_steps=10_000, shortest_episode=shortest))
+    assert (said in line) if said else line == ""
