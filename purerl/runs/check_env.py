@@ -185,16 +185,17 @@ def _check_same(reset: dict[str, str], step: dict[str, str]) -> None:
             f"{name} is in the state of {where} only: reset and step must return the same fields."
         )
     for name, spec in reset.items():
+        if spec == step[name]:
+            continue
         if "weakly" in spec + step[name]:
             raise EnvError(
-                f"{name} is weakly typed ({spec}; {step[name]}): give it a dtype, as in "
-                "jnp.float32(0) or jnp.zeros(())."
+                f"{name} is weakly typed in one of the two ({spec}; {step[name]}): give it a "
+                "dtype, as in jnp.float32(0) or jnp.zeros(())."
             )
-        if spec != step[name]:
-            raise EnvError(
-                f"{name} is {spec} from reset and {step[name]} from step: reset and step must "
-                "return the same shapes and dtypes."
-            )
+        raise EnvError(
+            f"{name} is {spec} from reset and {step[name]} from step: reset and step must "
+            "return the same shapes and dtypes."
+        )
 
 
 def _again(tree: PyTree) -> PyTree:

@@ -184,7 +184,7 @@ BROKEN = {
     ListMetrics: "metrics",
     IntegerObservation: r"observation\['policy'\]",
     NoObservation: "observation",
-    WeakReward: "reward is weakly typed",
+    WeakReward: "reward is weakly typed in one of the two",
     OtherMetric: r"metrics\['distance'\] is in the state of reset only",
     GrowingTask: r"task\['last_action'\] is in the state of step only",
     OtherShape: r"observation\['policy'\] is float32 \[2\] from reset and float32 \[3\] from step",
@@ -196,6 +196,22 @@ BROKEN = {
     HiddenMemoryInStep: "differs between two calls with equal states and actions",
     TracedBranch: "step cannot be traced",
 }
+
+
+class WeakClock(Toy):
+    """A clock that a person began with a Python number: weakly typed, from reset and from step."""
+
+    def reset(self, key):
+        return super().reset(key).replace(task={"time": jnp.add(0.0, 0.0)})
+
+    def step(self, state, action):
+        task = {"time": state.task["time"] + 0.1}
+        return super().step(state, action).replace(task=task)
+
+
+def test_what_is_weakly_typed_everywhere_passes_as_it_trains():
+    assert jnp.add(0.0, 0.0).weak_type
+    check_env(WeakClock())
 
 
 def test_a_right_environment_passes():
