@@ -107,6 +107,7 @@ def test_an_edited_package_refuses_to_resume_and_names_what_was_edited(copy, tmp
         edit(file)
     done = resume(copy, runs)
     assert done.returncode == USAGE and "begun under other conditions" in done.stderr
+    assert "Put back what was edited, train anew" in done.stderr
     named = [line.split(":")[0].strip() for line in done.stderr.splitlines() if "->" in line]
     assert named == [f"source.purerl.{room}.{file.stem}" for room, file in edited.items()]
 

@@ -54,6 +54,9 @@ def test_a_point_that_fails_is_counted(place, capsys):
     assert found["0.5"]["said"] == "gamma is 0.5. Take another one."
     assert found["0.6"]["said"] == "killed by SIGKILL" and found["0.6"]["n"] == "0"
     said = capsys.readouterr().out
+    begun = [line for line in said.splitlines() if "  begins  " in line]
+    logs = [Path(line.split("(progress: ")[1].rstrip(")")) for line in begun]
+    assert [log.stem for log in logs] == ["p0000", "p0001", "p0002"] and all(map(Path.exists, logs))
     assert "3 points (1 done, 2 failed)" in said and "p0001 failed: gamma is 0.5." in said
 
 
