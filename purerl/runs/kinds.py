@@ -20,24 +20,31 @@ def hints(kind: type) -> dict[str, Any]:
         return {}
 
 
-def fits(hint: Any, value: Any) -> bool:
-    """Tells whether a JSON value can be read as `hint`; True for hints it does not know.
+def fits(hint: Any, value: Any, exact: bool = False) -> bool:
+    """Tells whether a value, of JSON or of Python, is one for `hint`; True for hints unknown here.
+
+    Args:
+      hint: the annotation.
+      value: a setting, or how JSON holds it.
+      exact: whether a whole number must be one: no True, and no 2.0.
 
     >>> fits(tuple[int, ...], [64, 64]), fits(tuple[int, ...], 64), fits(float | None, "fast")
     (True, False, False)
     """
     origin, inner = get_origin(hint) or hint, get_args(hint)
+    value = value.name if isinstance(value, enum.Enum) else value  # so JSON holds it
     if origin in (Union, types.UnionType):
-        return any(fits(one, value) for one in inner)
+        return any(fits(one, value, exact) for one in inner)
     if origin is Literal:
         return value in [getattr(one, "name", one) for one in inner]
     if origin in (tuple, list):
         every = origin is list or inner[1:] == (...,)
-        wanted = inner[:1] * len(value) if every and isinstance(value, list) else inner
-        return isinstance(value, list) and (not inner or _all_fit(wanted, value))
+        wanted = inner[:1] * len(value) if every and isinstance(value, tuple | list) else inner
+        return isinstance(value, tuple | list) and (not inner or _all_fit(wanted, value, exact))
     if origin is dict:
         values = list(value.values()) if isinstance(value, dict) else []
-        return isinstance(value, dict) and (not inner or _all_fit(inner[1:] * len(values), values))
+        wanted = inner[1:] * len(values)
+        return isinstance(value, dict) and (not inner or _all_fit(wanted, values, exact))
     if origin is types.NoneType:
         return value is None
     if not isinstance(origin, type):
@@ -45,8 +52,19 @@ def fits(hint: Any, value: Any) -> bool:
     if issubclass(origin, enum.Enum):
         return isinstance(value, str) and value in origin.__members__
     if issubclass(origin, int | float):  # a whole number may stand for a float, true for 1
-        return isinstance(value, int | float)
-    return not issubclass(origin, str | Path) or isinstance(value, str)
+        return _is_number(origin, value) if exact else isinstance(value, int | float)
+    return not issubclass(origin, str | Path) or isinstance(value, str | origin)
+
+
+def _is_number(kind: type, value: Any) -> bool:
+    if kind is bool:
+        return isinstance(value, bool) or value in (0, 1)
+    kinds = int | float if issubclass(kind, float) else int
+    return isinstance(value, kinds) and not isinstance(value, bool)
+
+
+def _all_fit(hints: Any, values: Any, exact: bool) -> bool:
+    return len(hints) == len(values) and all(map(fits, hints, values, [exact] * len(values)))
 
 
 WORDS = {int: "a whole number", float: "a number", bool: "True or False", str: "a text"}
@@ -66,7 +84,7 @@ def wrong_value(record: Any, path: str = "") -> str:
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             if wrong := wrong_value(value, f"{where}."):
                 return wrong
-        elif value is not None and not _is_a(hint, value):
+        elif value is not None and not fits(hint, value, exact=True):
             return f"{where} is {value!r}; it must be {_in_words(hint)}."
     return ""
 
@@ -78,37 +96,6 @@ def _in_words(hint: Any) -> str:
     if get_origin(hint) is tuple and inner[1:] == (...,):
         return f"a tuple, each part {_in_words(inner[0])}"
     return WORDS.get(hint) or inspect.formatannotation(hint)
-
-
-def _is_a(hint: Any, value: Any) -> bool:
-    """Tells whether a setting in Python is of its annotated kind; True for kinds it does not know.
-
-    Stricter than `fits`: a whole number is no True, and no 2.0.
-    """
-    origin, inner = get_origin(hint) or hint, get_args(hint)
-    if origin in (Union, types.UnionType):
-        return any(_is_a(one, value) for one in inner)
-    if origin is Literal:
-        return value in inner
-    if origin in (tuple, list):
-        every = origin is list or inner[1:] == (...,)
-        wanted = inner[:1] * len(value) if every and isinstance(value, tuple | list) else inner
-        return isinstance(value, tuple | list) and (not inner or _all_are(wanted, value))
-    if origin is types.NoneType:
-        return value is None
-    if origin in (int, float):
-        return isinstance(value, origin | int) and not isinstance(value, bool)
-    if origin is bool:
-        return isinstance(value, bool) or value in (0, 1)
-    return origin is not str or isinstance(value, str)
-
-
-def _all_are(hints: Any, values: Any) -> bool:
-    return len(hints) == len(values) and all(map(_is_a, hints, values))
-
-
-def _all_fit(hints: Any, values: list) -> bool:
-    return len(hints) == len(values) and all(map(fits, hints, values))
 
 
 def meant(error: str, *kinds: type) -> str:
