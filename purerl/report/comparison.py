@@ -26,9 +26,9 @@ VERSUS = [
 ]  # fmt: skip
 GROUPS_CSV = ["label", "n", "done", "failed", "unfinished", "iqm", "mean", "tenth", "worst"]
 GROUPS_CSV += ["worst_run", "low", "high"]
+CURVES_CSV = ["group", "n", "steps", "iqm", "low", "high"]
 MANY = 3  # files of source code that differ, beyond which they are counted
 LONGEST_LABEL = 60  # beside the other columns it fits a wide terminal
-CURVES_CSV = ["group", "n", "steps", "iqm", "low", "high"]
 
 
 def compare(
@@ -96,7 +96,8 @@ def describe(result: dict[str, Any]) -> list[str]:
         lines += [f"  {line}" for line in pair["lines"]]
     for name, values in result["settings_that_differ"].items():
         lines.append(f"differs: {name} is {' | '.join(map(str, values))}")
-    lines += [f"other conditions: {line}" for line in few(result["conditions_that_differ"])]
+    conditions = manifest.count_files(result["conditions_that_differ"], MANY)
+    lines += [f"other conditions: {line}" for line in conditions]
     if result["unscored"]:
         return [*lines, f"No scores: {result['unscored']}"]
     groups, versus = result["groups"], result["versus_first"]
@@ -117,14 +118,6 @@ def describe(result: dict[str, Any]) -> list[str]:
     if result["pairs"]:
         lines.append("Runs of one configuration and seed count once, as the first of them.")
     return lines + notes(groups)
-
-
-def few(differences: Sequence[str]) -> list[str]:
-    """Returns lines of what differs: many files of source code as their number."""
-    files = [line for line in differences if line.startswith("source.")]
-    if len(files) <= MANY:
-        return list(differences)
-    return [line for line in differences if line not in files] + [f"source: {len(files)} files"]
 
 
 def short_names(labels: Sequence[str]) -> dict[str, str]:

@@ -6,7 +6,7 @@ A run writes it down at the start, and `--resume` compares it.
 import os
 import platform
 import subprocess
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -134,6 +134,14 @@ def differences(old: Any, new: Any, path: str = "") -> list[str]:
             found += differences(*values, f"{path}.{key}" if path else key)
         return found
     return [] if old == new else [f"{path}: {old} -> {new}"]
+
+
+def count_files(found: Sequence[str], most: int, remark: str = "") -> list[str]:
+    """Returns differences with the files of source code as their number, where they are many."""
+    files = [line for line in found if line.startswith("source.")]
+    if len(files) <= most:
+        return list(found)
+    return [line for line in found if line not in files] + [f"source: {len(files)} files{remark}"]
 
 
 def _version(package: str) -> str:

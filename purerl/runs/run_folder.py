@@ -182,10 +182,7 @@ def _shortened(found: list[str]) -> list[str]:
     """Returns differences for a person: many edited files as a number, and what to do for NPROC."""
     pin = "device.threads"  # a CPU's bits depend on the size of XLA's thread pool
     threads = [line.split()[1] for line in found if line.startswith(pin)]
-    edited = [line for line in found if line.startswith("source.")]
-    if len(edited) > MANY:
-        found = [line for line in found if line not in edited]
-        found.append(f"source: {len(edited)} files, as of another version of purerl")
+    found = manifest.count_files(found, MANY, ", as of another version of purerl")
     return found + [f"(NPROC={number} brings {pin} back)" for number in threads]
 
 
