@@ -17,7 +17,6 @@ import csv
 import itertools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NoReturn
 
 from envs.suite.tasks import TASKS
 from experiments.benchmarks import suite_pictures, suite_scores
@@ -28,20 +27,13 @@ from purerl.runs.files import runs_in
 from purerl.sweep import main as sweep
 
 
-class Parser(argparse.ArgumentParser):
-    """Tells what is wrong in one line, as purerl's commands do."""
-
-    def error(self, message: str) -> NoReturn:
-        """Raises UserError where argparse would print all options and exit."""
-        raise UserError(f"{message}. All options: {self.prog} --help")
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code, which is that of the sweep."""
-    parser = Parser(
+    parser = argparse.ArgumentParser(
         prog="python -m experiments.benchmarks.suite_benchmark",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
+        exit_on_error=False,  # it would print all options
     )
     parser.add_argument("tasks", nargs="*", help="which tasks; all by default")
     parser.add_argument(
@@ -68,7 +60,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="PATH",
         help="train nothing: score these files seeds.csv, and folders of runs",
     )
-    options, settings = parser.parse_known_args(arguments)
+    try:
+        options, settings = parser.parse_known_args(arguments)
+    except argparse.ArgumentError as error:
+        raise UserError(f"{error}. All options: {parser.prog} --help") from error
     if options.scores is not None:
         sources = [given(place) for place in options.scores]
         seeds = suite_scores.merged(sources)
