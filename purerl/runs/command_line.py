@@ -165,7 +165,7 @@ _IN_WORDS: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"^Error parsing (\S+): could not convert .*?: (.*)", r"\1 is \2; it must be a number"),
     (
         r"^Error parsing (\S+): Could not find valid parse for arguments: \[(.*)\]",
-        r"\1 is \2; write whole numbers with spaces between them, such as 64 64",
+        r"\1 is \2; write numbers with spaces between them, such as 64 64",
     ),
     (r"^invalid choice (.*) for argument '(\S+)'.*\((.*)\)", _wrong_choice),
     (r"^Missing from .*?: [A-Z.,\[\]{} ]+?(?=[A-Z][a-z'])", "The command lacks: "),
