@@ -206,16 +206,16 @@ def _step(
     over = terminated | truncated | lost
     reward = jnp.where(lost, 0.0, env_state.reward)
     discounted_return = config.gamma * carry.discounted_return + reward
-    # A fresh start may itself be NaN, and 0 times NaN is no 0.
-    log_prob = distributions.log_prob(distribution, raw)
-    seen = carry.env.observation, raw, log_prob, output.value
-    observation, raw, log_prob, value = select(lost, jax.tree.map(jnp.zeros_like, seen), seen)
+    # A fresh start may itself be NaN, and 0 times NaN is no 0. A value that is a number stays:
+    # the step before bootstraps from it.
+    seen = carry.env.observation, raw, distributions.log_prob(distribution, raw)
+    observation, raw, log_prob = select(lost, jax.tree.map(jnp.zeros_like, seen), seen)
     transition = Transition(
         observation=observation,
         raw_action=raw,
         noise=noise,
         log_prob=log_prob,
-        value=value,
+        value=jnp.where(lost & ~jnp.isfinite(output.value), 0.0, output.value),
         reward=reward,
         discounted_return=discounted_return,
         terminated=terminated,

@@ -42,20 +42,23 @@ def test_hand_worked_table():
     np.testing.assert_array_equal(advantage, [0.25, 1.0, -2.25, 3.0, 1.0])
 
 
-def test_invalid_step_passes_nothing_back():
+@pytest.mark.parametrize("done", [0, 1])
+def test_invalid_step_passes_nothing_back(done):
     """Step 1 is lost: its advantage is 0 and step 0 bootstraps from its own next value.
 
-    delta_0 = 1 + 0.5 * 4 - 2 = 1 = A_0, although step 1 carries an absurd reward.
+    delta_0 = 1 + 0.5 * 4 - 2 = 1 = A_0, although step 1 carries an absurd reward, and step 2,
+    of another episode, has the advantage 3 + 0.5 * 2 - 2 = 2. Whether the lost step is done or not
+    makes no difference.
     """
     advantage = run(
-        reward=[1, 1e5, 1],
+        reward=[1, 1e5, 3],
         value=[2, 4, 2],
         next_value=[4, 1e5, 2],
         terminated=[0, 0, 0],
-        done=[0, 1, 0],
+        done=[0, done, 0],
         valid=[True, False, True],
     )
-    np.testing.assert_array_equal(advantage, [1.0, 0.0, 0.0])
+    np.testing.assert_array_equal(advantage, [1.0, 0.0, 2.0])
 
 
 def slow_reference(reward, value, next_value, terminated, done):

@@ -269,6 +269,9 @@ def test_a_blown_up_environment_is_contained():
     assert (
         finished["nonfinite_resets"].sum() == (~lost.valid).sum() == finished["nonfinite_resets"][3]
     )
+    # A step before the first lost one bootstraps from the value of a state that was still sound.
+    t = int(np.argmin(lost.valid[:, 3]))
+    assert lost.value[t, 3] == sound.value[t, 3] != 0
     for a, b in zip(jax.tree.leaves(sound), jax.tree.leaves(lost), strict=True):
         others = [0, 1, 2, 4, 5]
         np.testing.assert_array_equal(np.asarray(a)[:, others], np.asarray(b)[:, others])
