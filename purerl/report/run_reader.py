@@ -50,7 +50,8 @@ class RunRecord(NamedTuple):
             return "done"
         skipped = last.get("train/skipped_in_a_row") or 0
         # What is not finite stands as null in the file.
-        null = [last.get(f"train/{name}", 0.0) is None for name in ("loss", "parameter_norm")]
+        names = ("loss", "parameter_norm", "reward")  # as `loop` asks them
+        null = [last.get(f"train/{name}", 0.0) is None for name in names]
         return "failed" if skipped >= MAX_SKIPPED_IN_A_ROW or any(null) else "unfinished"
 
     def curve(self, metric: str) -> dict[int, float]:
@@ -82,17 +83,34 @@ def read(path: Path) -> RunRecord:
     config = read_json(path / "config.json", experiment=str, settings=dict)
     settings = check_object(str(path / "config.json"), config["settings"], seed=int, ppo=dict)
     experiment = {"experiment": config["experiment"]}
+    facts = read_json(path / "manifest.json")
     learning = {k: v for k, v in settings.items() if k not in NOT_LEARNING}
     file = path / "metrics.jsonl"
     return RunRecord(
         path=path,
         seed=settings["seed"],
-        settings=experiment | _flatten(learning) | experiment,
-        manifest=read_json(path / "manifest.json"),
+        settings=experiment | _flatten(learning) | experiment | _went_on(facts),
+        manifest=facts,
         source=read_bytes(path / "experiment.py"),
         lines=[_check_line(f"{file}, line {i}", x) for i, x in enumerate(read_metrics(file), 1)],
         planned=_planned_updates(settings["ppo"]),
     )
+
+
+def _went_on(facts: dict[str, Any]) -> dict[str, Any]:
+    """Returns as a setting what was changed while a run was trained, {} if nothing was.
+
+    A run that went on with other settings, or other code of its own, is not one that had them from
+    the start. The library's code, versions and devices are conditions: `compare` names them.
+    """
+    found = [
+        f"{line} after update {change.get('after_update')}"
+        for change in facts.get("allowed_changes", [])
+        for line in change.get("changes", [])
+        if line.startswith(("settings.", "experiment.py", "source."))
+        and not line.startswith("source.purerl.")
+    ]
+    return {"went_on_with": "; ".join(found)} if found else {}
 
 
 def _check_line(where: str, line: dict[str, Any]) -> dict[str, Any]:

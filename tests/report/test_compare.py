@@ -160,9 +160,10 @@ def test_failed_runs_count_and_unfinished_ones_do_not(tmp_path, capsys):
     runs = tmp_path / "runs"
     make_seeds(runs, "a", [10.0, 11.0, 12.0])
     make_run(runs / "exploded", 7, [2.0, None], more={"train/skipped_in_a_row": 10.0})
+    make_run(runs / "no_step_was_sound", 9, [3.0, None], more={"train/reward": None})
     make_run(runs / "killed", 8, [1.0, 1.0])
     (group,) = found(tmp_path, runs)["groups"]
-    assert (group["n"], group["done"], group["failed"], group["unfinished"]) == (4, 3, 1, 1)
+    assert (group["n"], group["done"], group["failed"], group["unfinished"]) == (5, 3, 2, 1)
     assert group["worst"] == 2.0 and group["worst_run"].endswith("exploded")
     said = capsys.readouterr().out
     assert "1 unfinished runs are left out." in said and "Failed runs" in said
@@ -225,6 +226,31 @@ def test_equal_digests_are_the_same_run_and_count_once(tmp_path, capsys):
     assert pair["same"] and pair["promised"] and pair["last_equal"] == 4
     assert result["groups"][0]["n"] == 1
     assert "same: 4 digests, the last d4 of update 4" in capsys.readouterr().out
+
+
+def went_on(*changes: str) -> dict:
+    return {"allowed_changes": [{"after_update": 2, "changes": list(changes)}]}
+
+
+def test_a_run_that_went_on_with_other_settings_is_another_one(tmp_path, capsys):
+    """It has the settings of the other in the end, and was not trained with them from the start."""
+    make_run(tmp_path / "runs" / "direct", 1, [1.0] * 4, digests=["d1", "d2"])
+    changed = went_on("settings.ppo.num_steps: 200 -> 400")
+    make_run(tmp_path / "runs" / "longer", 1, [3.0] * 4, digests=["d1", "e2"], **changed)
+    result = found(tmp_path, tmp_path / "runs", code=0)
+    assert result["pairs"] == [] and [group["n"] for group in result["groups"]] == [1, 1]
+    said = "settings.ppo.num_steps: 200 -> 400 after update 2"
+    assert result["settings_that_differ"] == {"went_on_with": [None, said]}
+    assert said in capsys.readouterr().out
+
+
+def test_a_run_that_went_on_under_other_conditions_promises_no_bits(tmp_path, capsys):
+    changes = ("versions.jax: 1 -> 2", "source.purerl.ppo.losses: a -> b")
+    make_run(tmp_path / "runs" / "a", 1, [1.0] * 4, digests=["d1"])
+    make_run(tmp_path / "runs" / "b", 1, [1.0] * 4, digests=["e1"], **went_on(*changes))
+    result = found(tmp_path, tmp_path / "runs", code=0)
+    assert not result["pairs"][0]["promised"] and result["groups"][0]["n"] == 1
+    assert "runs/b went on after a change" in capsys.readouterr().out
 
 
 def test_other_seeds_are_not_twins(tmp_path):
