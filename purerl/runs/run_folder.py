@@ -136,9 +136,28 @@ def begin_or_go_on(
             + f"\n{cure(found)}, train anew under another --name, or go on all the same with "
             "--allow-changes."
         )
-    if found:
+    if found and _is_done(folder, settings):
+        _check_nothing_changed(folder, found)
+    elif found:
         checkpoint.check_fits(folder / "checkpoints", abstract)
         _write(folder, source, settings, facts | _noted(folder, old, found))
+
+
+def _is_done(folder: Path, settings: dict[str, Any]) -> bool:
+    """Tells whether a run has all updates that `settings`, of config.json, ask for."""
+    ppo = settings["settings"]["ppo"]
+    planned = ppo["num_steps"] // (ppo["num_envs"] * ppo["rollout_length"])
+    return max(checkpoint_folder.updates(folder / "checkpoints"), default=0) >= planned
+
+
+def _check_nothing_changed(folder: Path, found: list[str]) -> None:
+    """Raises UserError where a run that is done would be given settings that it never had."""
+    changed = [line for line in found if line.startswith("settings.")]
+    if changed:
+        raise UserError(
+            f"The run {folder} has all of its updates, so none would be trained with what is new:"
+            "\n  " + "\n  ".join(changed) + "\nRaise --ppo.num-steps, or use another --name."
+        )
 
 
 def _write(folder: Path, source: Source, settings: dict[str, Any], facts: dict[str, Any]) -> None:
@@ -166,11 +185,28 @@ def cure(found: list[str]) -> str:
         return "Put the file back that was edited"
     if any(line.startswith("vmapped_seeds") for line in found):
         return "Give the --num-seeds and --seed it was begun with"
+    if any("purerl_experiment_" in line and "(absent)" in line for line in found):
+        return "Give the command in the folder it was begun in"
     if all(line.startswith(("source.", "experiment.py: ")) for line in found):
         return "Put back what was edited"
+    given = "Give the command it was begun with" + _options(found)
     if any(line.startswith("settings.ppo.num_steps") for line in found):
-        return "To train longer, copy the run first (docs/howto/go_on.md)"
-    return "Give the command it was begun with"
+        return f"{given}; to train longer, copy the run first (docs/howto/go_on.md)"
+    return given
+
+
+def _options(found: list[str]) -> str:
+    """Returns the options that bring settings back that differ, in brackets; "" if there is none.
+
+    >>> _options(["settings.ppo.num_steps: 300000 -> 500000", "versions.jax: 1 -> 2"])
+    ' (--ppo.num-steps 300000)'
+    """
+    lines = [line.removeprefix("settings.") for line in found if line.startswith("settings.")]
+    parts = [line.partition(" -> ")[0].split(": ", 1) for line in lines]
+    words = [
+        f"--{name.replace('_', '-')} {value.strip('[]').replace(',', '')}" for name, value in parts
+    ]
+    return f" ({' '.join(words)})" if words else ""
 
 
 def _identity(folder: Path) -> dict[str, str]:

@@ -172,6 +172,15 @@ def test_a_run_on_c_imports_no_other_engine():
         (["settings.ppo.gamma: 0.99 -> 0.9", run_folder.EDITED], "Put the file back"),
         (["vmapped_seeds: {'first': 1, 'number': 3} -> (absent)"], "--num-seeds and --seed"),
         (["schedule.log_every: 1 -> 2", "settings.ppo.num_steps: 9 -> 99"], "go_on.md"),
+        (["settings.ppo.num_steps: 9 -> 99"], "the command it was begun with (--ppo.num-steps 9);"),
+        (
+            ["settings.network.policy_hidden: [8, 16] -> [8]", "settings.seed: 2 -> 1"],
+            "begun with (--network.policy-hidden 8 16 --seed 2)",
+        ),
+        (
+            ["source.pk.mine: ab -> (absent)", "source.purerl_experiment_mine: (absent) -> ab"],
+            "in the folder it was begun in",
+        ),
     ],
 )
 def test_a_refusal_to_go_on_names_what_helps(found, cure):

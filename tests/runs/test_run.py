@@ -475,6 +475,7 @@ def test_a_copy_that_goes_on_otherwise_is_a_run_of_its_own(tmp_path):
     copy = folder(tmp_path).with_name("wide")
     shutil.copytree(folder(tmp_path), copy)
     words = ["--name", "wide", "--resume", "--allow-changes", "--ppo.learning-rate", "3e-4"]
+    words += ["--ppo.num-steps", "799"]
     for _ in range(2):  # and stays it
         assert start(tmp_path, *words) == SUCCESS
         second = json.loads((copy / "manifest.json").read_text())
@@ -482,6 +483,21 @@ def test_a_copy_that_goes_on_otherwise_is_a_run_of_its_own(tmp_path):
         (change,) = second["allowed_changes"]
         assert change["of"] == {"run_id": first["run_id"], "name": "seed1"}
     assert json.loads((folder(tmp_path) / "manifest.json").read_text()) == first
+
+
+def test_a_run_that_is_done_is_not_given_settings_that_it_never_had(tmp_path, monkeypatch, capsys):
+    start(tmp_path)
+    before = [f.read_bytes() for f in sorted(folder(tmp_path).glob("*.json"))]
+    words = ["--resume", "--allow-changes", "--ppo.learning-rate", "3e-4"]
+    said = refused(capsys, start(tmp_path, *words))
+    assert "has all of its updates" in said and "Raise --ppo.num-steps" in said
+    assert "settings.ppo.learning_rate: 0.001 -> 0.0003" in said
+    assert [f.read_bytes() for f in sorted(folder(tmp_path).glob("*.json"))] == before
+    # What only surrounds it may have changed, and is not noted of a run that trains no more.
+    monkeypatch.setenv("NCCL_ALGO", "Ring")
+    assert "NCCL_ALGO" in refused(capsys, start(tmp_path, "--resume"))
+    assert start(tmp_path, "--resume", "--allow-changes") == SUCCESS
+    assert [f.read_bytes() for f in sorted(folder(tmp_path).glob("*.json"))] == before
 
 
 def test_changes_that_no_checkpoint_fits_leave_the_run_as_it_was(tmp_path, stop_after, capsys):
