@@ -21,6 +21,7 @@ from purerl.core.errors import UserError
 from purerl.runs.command_errors import leave
 from purerl.runs.command_line import carry_out
 from purerl.runs.options import PlayOptions
+from purerl.runs.output import show
 
 NEEDS = {"npz": (), "jax": ("flatbuffers",), "onnx": ("onnx", "onnxruntime")}  # format: packages
 
@@ -52,8 +53,8 @@ def command(options: Options) -> None:
     write = writer(options.format)
     run = load(options.run, options.checkpoint, options.engine, options.trust)
     policy = write(run, file)
-    print(record_episodes(run, options.seed).compare(policy))
-    print(f"{file} ({file.stat().st_size:,} bytes)")
+    show(record_episodes(run, options.seed).compare(policy))
+    show(f"{file} ({file.stat().st_size:,} bytes)")
 
 
 def writer(name: str) -> Any:

@@ -11,6 +11,7 @@ from jax import export
 from purerl.core.records import PyTree
 from purerl.report.flat_program import batched
 from purerl.report.policy_function import PolicyFunction, policy_function
+from purerl.runs.files import write_answer
 from purerl.runs.loaded_run import Run
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
@@ -21,8 +22,9 @@ def write_jax(run: Run, file: Path) -> Callable[[Any], np.ndarray]:
     policy = policy_function(run)
     arguments = batched((policy.observation, policy.memory), *export.symbolic_shape("batch"))
     exported = export.export(jax.jit(policy.act), platforms=PLATFORMS)(*arguments)
-    file.write_bytes(exported.serialize())
-    return remembering(policy, export.deserialize(bytearray(file.read_bytes())).call)
+    content = exported.serialize()
+    write_answer(file, bytes(content))
+    return remembering(policy, export.deserialize(bytearray(content)).call)
 
 
 def remembering(

@@ -1,5 +1,6 @@
 """A policy of a default network as arrays by name; `numpy_policy.py` is their reader."""
 
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from purerl.core.errors import UserError
 from purerl.ppo import networks, running_moments
 from purerl.report.numpy_policy import Policy
 from purerl.report.policy_file import control_range, origin
+from purerl.runs.files import write_answer
 from purerl.runs.loaded_run import Run
 
 
@@ -20,8 +22,9 @@ def write_npz(run: Run, file: Path) -> Callable[[Any], np.ndarray]:
       UserError: the network is none of `networks.mlp` and `networks.recurrent`.
     """
     arrays = policy_arrays(run)
-    with file.open("wb") as opened:  # by its name, numpy would give it another
-        np.savez(opened, **arrays)
+    content = io.BytesIO()
+    np.savez(content, **arrays)
+    write_answer(file, content.getvalue())
     policy = Policy(file)
     return lambda observation: policy(networks.policy_features(observation))
 
@@ -42,7 +45,7 @@ def policy_arrays(run: Run) -> dict[str, Any]:
         )
     options, params = run.experiment.network, run.state.params["params"]
     cell = getattr(options, "cell", "")
-    layers = params["encoder" if cell else "policy"]
+    layers = params.get("encoder" if cell else "policy", {})  # Flax has none of no layers
     dense = {f"layer{i}": layers[f"Dense_{i}"] for i in range(len(layers))}
     dense |= params.get("cell", {}) | {"loc": params["head"]["loc"]}
     return _normalizer(run) | {

@@ -17,6 +17,7 @@ from purerl.report.onnx_nodes import OPSET, write_step
 from purerl.report.policy_file import control_range, origin
 from purerl.report.policy_function import PolicyFunction, policy_function
 from purerl.report.policy_jax import remembering
+from purerl.runs.files import write_answer
 from purerl.runs.loaded_run import Run
 
 IR_VERSION = 8  # the file format that goes with the operator set
@@ -31,7 +32,7 @@ def write_onnx(run: Run, file: Path) -> Callable[[Any], np.ndarray]:
     policy = policy_function(run)
     model = build_model(policy, control_range(run), origin(run))
     onnx.checker.check_model(model, full_check=True)
-    file.write_bytes(model.SerializeToString())
+    write_answer(file, model.SerializeToString())
     return remembering(policy, caller(file))
 
 

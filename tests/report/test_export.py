@@ -30,6 +30,7 @@ OWN = {"ppo.num_steps": 512, "ppo.num_envs": 4, "ppo.rollout_length": 16, "ppo.e
 KINDS = {
     "relu": (privileged, {"network.activation": "relu"}),
     "elu": (privileged, {"network.activation": "elu", "network.policy_hidden": (9, 7)}),
+    "linear": (privileged, {"network.policy_hidden": ()}),
     "gru": (recurrent, {"network.cell": "gru", "network.activation": "tanh"}),
     "lstm": (recurrent, {}),
     "own": (custom_network, OWN),
@@ -66,7 +67,7 @@ def place(tmp_path_factory) -> Path:
     return tmp_path_factory.mktemp("runs")
 
 
-BOTH = ["relu", pytest.param("elu", marks=SLOW), pytest.param("gru", marks=SLOW), "lstm"]
+BOTH = ["relu", "linear", pytest.param("elu", marks=SLOW), pytest.param("gru", marks=SLOW), "lstm"]
 
 
 @pytest.mark.parametrize("kind", BOTH)
@@ -136,7 +137,7 @@ def test_mistakes_are_one_line(place, tmp_path, capsys):
     with pytest.raises(purerl.UserError, match="network is one of your own: use --format jax"):
         policy_npz.write_npz(trained("own", place)[0], tmp_path / "p.npz")
     assert not (tmp_path / "p.npz").exists()
-    for out in (tmp_path / "no" / "p.npz", tmp_path):
+    for out in (tmp_path / "no" / "p.npz", tmp_path, Path("/dev/full")):
         assert commands.main(["export", str(run.folder), "--out", str(out)]) == USAGE
         said = capsys.readouterr().err
         assert "cannot be written" in said and said.count("\n") == 1

@@ -135,6 +135,8 @@ def test_a_module_that_is_applied_twice_is_noted_twice():
     [
         (["--episodes", "0"], "episodes is 0; it must be at least 1"),
         (["--out", "/nowhere/x.npz"], "/nowhere/x.npz cannot be written"),
+        (["--out", "/tmp"], "/tmp cannot be written"),
+        (["--out", "/dev/full", "--episodes", "1"], "/dev/full cannot be written: No space left"),
         (["--checkpoint", "77"], "There is no checkpoint '77'"),
     ],
 )
