@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from purerl.core.env import Env, EnvError
 from purerl.core.errors import RunError, UserError, one_line
@@ -105,6 +106,7 @@ def _check_network(network: Network, observation: PyTree, action_size: int) -> N
                 "are trained, so they are floating-point numbers. Keep constants in the closure of "
                 "`apply`."
             )
+    _check_memory_starts_at_zero(network, carry)
     batch = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct((2, *x.shape), x.dtype), (observation, carry)
     )
@@ -130,6 +132,17 @@ def _check_network(network: Network, observation: PyTree, action_size: int) -> N
             f"The network's memory goes in as {kinds[0]} and comes back as {kinds[1]}, for 2 "
             "environments; `apply` must return it as it was given, and `init` one environment's."
         )
+
+
+def _check_memory_starts_at_zero(network: Network, carry: PyTree) -> None:
+    """Raises ValueError unless `init` gives a memory of zeros, with which every episode starts."""
+    if jax.tree.leaves(carry):
+        memory = jax.jit(lambda key: network.init(key)[1])(jax.random.key(0))
+        if any(np.asarray(x).any() for x in jax.tree.leaves(memory)):
+            raise ValueError(
+                "The network's memory starts as other numbers than 0, and every episode starts "
+                "with zeros: return zeros from `init`, and add the rest in `apply`."
+            )
 
 
 def _pair(call: str, first: str, function: Callable[..., Any], *arguments: Any) -> Any:

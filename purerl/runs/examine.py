@@ -91,6 +91,9 @@ def check_settings(config: Config) -> Iterator[Finding]:
         what = f"{config.num_updates} in the whole run, of {config.steps_per_update:,} steps each"
         yield warning("updates", f"{what}: lower ppo.rollout_length, or raise ppo.num_steps.")
     fixed = config.schedule != "adaptive_kl"
+    if not fixed and config.num_epochs * config.num_minibatches == 1:
+        what = "an update has one minibatch, before which the policy has not moved, so its KL is 0"
+        yield warning("schedule", f"{what} and the rate only rises: raise ppo.num_epochs.")
     if fixed and config.desired_kl != Config.desired_kl:
         what = f"nothing reads {config.desired_kl} where ppo.schedule is {config.schedule!r}"
         yield warning("desired_kl", f"{what}: choose 'adaptive_kl', or leave desired_kl out.")

@@ -81,19 +81,26 @@ def available() -> dict[str, Path]:
     for folder in _folders():
         about = folder / "__init__.py"
         order = re.findall(r"\w+", about.read_text()) if about.exists() else []
-        # Other scripts may stand beside the experiments.
-        has_one = re.compile(r"^experiment(: *Experiment)? = ", re.MULTILINE)
-        files = [file for file in sorted(folder.glob("*.py")) if has_one.search(file.read_text())]
+        files = [file for file in sorted(folder.glob("[!.]*.py")) if _has_experiment(file)]
         files.sort(key=lambda file: order.index(file.stem) if file.stem in order else len(order))
         found = found | {file.stem: file for file in files if file.stem not in found}
     return found
 
 
+def _has_experiment(path: Path) -> bool:
+    """Tells whether a file defines an experiment, as other scripts, or an editor's link, do not."""
+    try:
+        text = path.read_bytes()
+    except OSError:
+        return False
+    return re.search(rb"^experiment(: *Experiment)? = ", text, re.MULTILINE) is not None
+
+
 def summary(path: Path) -> str:
     """Returns the first line of a file's docstring, without running the file."""
     try:
-        text = ast.get_docstring(ast.parse(path.read_text()))
-    except (OSError, SyntaxError):
+        text = ast.get_docstring(ast.parse(path.read_bytes()))
+    except (OSError, SyntaxError, ValueError):
         text = None
     return text.splitlines()[0] if text else ""
 

@@ -2,6 +2,7 @@
 
 import functools
 from dataclasses import dataclass
+from numbers import Integral
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -114,9 +115,11 @@ class Run:
 
         from purerl.core.keys import Purpose, derive
         from purerl.ppo.evaluation import evaluate
+        from purerl.runs.options import check_seed
 
-        if episodes < 1:
-            raise UserError(f"episodes is {episodes}; it must be at least 1.")
+        check_seed(seed)
+        if not isinstance(episodes, Integral) or episodes < 1:
+            raise UserError(f"episodes is {episodes}; it must be a whole number, at least 1.")
         config, env, network, engine = self.restored.setup
 
         def judge(state: Any, key: Any) -> dict[str, Any]:

@@ -1,16 +1,31 @@
 """One process writes a run: it holds a lock on the folder, until it ends in whatever way."""
 
+import contextlib
 import errno
 import fcntl
 import os
+import time
 from pathlib import Path
 
 from purerl.core.errors import RunError, UserError
 from purerl.runs.files import make_folder
 
 LOCK = ".lock"
+PATIENCE, PAUSE = 1.0, 0.05  # seconds
 # NFS locks no folder, and no read-only file; some file systems lock nothing at all.
 NO_LOCKS = {errno.EBADF, errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL}
+
+
+def _lock(handle: int, patience: float) -> None:
+    """Locks a handle; BlockingIOError if another process has it for longer than `patience` s.
+
+    Whoever asks whether a run is being trained (`sweep`) holds its lock for a moment.
+    """
+    for _ in range(int(patience / PAUSE)):
+        with contextlib.suppress(BlockingIOError):
+            return fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        time.sleep(PAUSE)
+    return fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 class RunLock:
@@ -20,9 +35,10 @@ class RunLock:
     system locks no folder, the file `.lock` in it is. That file says who writes.
     """
 
-    def __init__(self, folder: Path) -> None:
-        """Makes the folder and locks it; UserError if another process writes it."""
+    def __init__(self, folder: Path, patience: float = PATIENCE) -> None:
+        """Makes the folder and locks it; UserError if another process writes it, for so many s."""
         make_folder(folder)
+        self.patience = patience
         self.folder = folder
         self.handles = [os.open(folder, os.O_RDONLY | os.O_DIRECTORY)]
         try:
@@ -37,7 +53,7 @@ class RunLock:
     def _try(self, handle: int) -> bool:
         """Locks a handle; False where the file system has no such lock."""
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(handle, self.patience)
         except BlockingIOError as error:
             owner = os.pread(self.handles[1], 20, 0).decode(errors="replace").strip() or "unknown"
             raise UserError(

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import shutil
+import threading
 import time
 import types
 from pathlib import Path
@@ -319,6 +320,15 @@ def test_a_deleted_lock_file_lets_nobody_in(tmp_path):
     with pytest.raises(UserError, match=f"process (unknown|{os.getpid()})"):
         RunLock(tmp_path / "run")
     held.close()
+    RunLock(tmp_path / "run").close()
+
+
+def test_who_only_looks_whether_a_run_is_locked_keeps_nobody_out(tmp_path):
+    """A look holds the lock for a moment, which the one who wants to train waits for."""
+    held = RunLock(tmp_path / "run")
+    threading.Timer(0.2, held.close).start()
+    with pytest.raises(UserError):
+        RunLock(tmp_path / "run", patience=0.0)
     RunLock(tmp_path / "run").close()
 
 

@@ -166,6 +166,8 @@ def test_a_run_of_few_updates_and_a_setting_that_nothing_reads_are_named():
     assert "49 in the whole run, of 128 steps each" in said(num_steps=50 * 128 - 1)["updates"]
     assert "reads 0.02 where" in said(num_steps=6400, desired_kl=0.02)["desired_kl"]
     assert said(num_steps=6400, desired_kl=0.02, schedule="adaptive_kl") == {}
+    one = said(num_steps=6400, schedule="adaptive_kl", num_epochs=1, num_minibatches=1)
+    assert "its KL is 0" in one["schedule"]
 
 
 def test_speed_is_measured_only_when_asked(monkeypatch):

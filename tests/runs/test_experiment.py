@@ -33,6 +33,15 @@ def test_an_experiment_is_found_by_name_path_and_module(place):
     assert "hopper" in found and not {"plot", "benchmark"} & set(found)
 
 
+def test_what_cannot_be_read_beside_the_experiments_harms_none(place):
+    (place / "experiments" / ".#hopper.py").symlink_to("nobody@host.123")  # as Emacs locks a file
+    (place / "experiments" / "gone.py").symlink_to("nowhere")
+    (place / "experiments" / "latin.py").write_bytes(b"# caf\xe9\nexperiment = None\n")
+    found = experiment.available()
+    assert "hopper" in found and "latin" in found and not {"gone", ".#hopper"} & set(found)
+    assert experiment.summary(found["latin"]) == ""
+
+
 @pytest.mark.parametrize("name", ["hoper", "experiments/none.py", "tests.none_such", "no_such.x"])
 def test_an_unknown_experiment_is_one_line(place, name):
     with pytest.raises(UserError) as error:

@@ -39,6 +39,7 @@ def changed(part, **settings):
             "network.std is 'both'; it must be 'learned' or 'state'.",
         ),
         (dataclasses.replace(EXPERIMENT, seed="2"), "seed is '2'; it must be a whole number."),
+        (dataclasses.replace(EXPERIMENT, seed=None), "seed is None; it must be a whole number."),
     ],
 )
 def test_a_value_of_the_wrong_kind_is_told_and_never_trained(experiment, told):

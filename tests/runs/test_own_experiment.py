@@ -167,6 +167,7 @@ SOUND = {"actions": "1", "value": "observation[..., 0] * params", "carry": "carr
         ({"value": "observation * params"}, "network's value is [2, 5]"),
         ({"value": "params"}, "network's value is []"),
         ({"start": "jnp.zeros(4)", "carry": "carry[..., :3]"}, "network's memory goes in as"),
+        ({"start": "jnp.ones(4)"}, "network's memory starts as other numbers than 0"),
     ],
 )
 def test_a_network_whose_answers_have_other_shapes_is_one_line(place, capsys, wrong, message):

@@ -116,6 +116,21 @@ def test_known_code_reads_beside_where_it_was_known_not_where_a_stranger_says(
     assert module["__file__"] == str(trained.parent.parent / "mine.py")
 
 
+def test_with_trust_what_stood_beside_a_file_that_is_gone_is_looked_for_in_the_run(
+    given, home, tmp_path
+):
+    """A project's folder was renamed: what its experiment reads is put beside the run's copy."""
+    gone = tmp_path / "renamed_since" / "mine.py"
+    trust.remember((given / "experiment.py").read_bytes(), gone)
+    change(given / "manifest.json", experiment_file=str(gone))
+    places = [
+        purerl.load(given, trust=trust).experiment.build_env.__globals__["__file__"]
+        for trust in (False, True, False)
+    ]
+    here = str((given / "experiment.py").resolve())
+    assert places == [str(gone), here, here]
+
+
 def test_a_link_to_a_run_is_a_run_and_a_link_to_code_is_none(given, tmp_path, capsys):
     (tmp_path / "link").symlink_to(given)
     assert evaluate.main([str(tmp_path / "link"), *FEW]) == SUCCESS

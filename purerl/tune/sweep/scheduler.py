@@ -74,7 +74,7 @@ def is_locked(job: Job) -> bool:
     for folder in job.folders:
         if folder.is_dir():
             try:
-                RunLock(folder).close()
+                RunLock(folder, patience=0.0).close()
             except UserError:
                 return True
             except OSError:  # the run itself will say what is wrong with it
