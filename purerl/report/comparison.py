@@ -217,7 +217,7 @@ def plotter() -> Any:
     return pyplot
 
 
-def draw_curves(path: Path, curves: Iterable[Curve], metric: str) -> None:
+def draw_curves(path: Path, curves: Sequence[Curve], metric: str) -> None:
     """Writes a picture of each group's IQM, its band, and its runs as thin lines."""
     pyplot = plotter()
     figure, axes = pyplot.subplots(figsize=(8, 5), layout="constrained")
@@ -230,10 +230,19 @@ def draw_curves(path: Path, curves: Iterable[Curve], metric: str) -> None:
             axes.fill_between(curve.steps, low, high, color=color, alpha=0.2, linewidth=0)
         label = printable(f"{curve.label} (n = {len(curve.runs)})")
         axes.plot(curve.steps, iqm, color=color, linewidth=2, label=label)
-    axes.set(
-        xlabel="control steps", ylabel=printable(metric), title="Interquartile mean, 95% intervals"
-    )
+    axes.plot([], [], color="gray", linewidth=0.5, label="each run")
+    axes.set(xlabel="control steps", ylabel=printable(metric), title=curves_title(curves))
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
     figure.savefig(path, dpi=120)
     pyplot.close(figure)
+
+
+def curves_title(curves: Iterable[Curve]) -> str:
+    """Returns the title of a picture of curves: it names intervals only where some are drawn."""
+    with_band = [curve.band.low is not None for curve in curves]
+    if all(with_band):
+        return "Interquartile mean, 95% intervals"
+    if any(with_band):
+        return f"Interquartile mean, 95% intervals where there are {LEAST_RUNS} seeds or more"
+    return f"Interquartile mean (no intervals below {LEAST_RUNS} seeds)"

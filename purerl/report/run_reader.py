@@ -85,11 +85,12 @@ def read(path: Path) -> RunRecord:
     experiment = {"experiment": config["experiment"]}
     facts = read_json(path / "manifest.json")
     learning = {k: v for k, v in settings.items() if k not in NOT_LEARNING}
+    went_on = _went_on(str(path / "manifest.json"), facts)
     file = path / "metrics.jsonl"
     return RunRecord(
         path=path,
         seed=settings["seed"],
-        settings=experiment | _flatten(learning) | experiment | _went_on(facts),
+        settings=experiment | _flatten(learning) | experiment | went_on,
         manifest=facts,
         source=read_bytes(path / "experiment.py"),
         lines=[_check_line(f"{file}, line {i}", x) for i, x in enumerate(read_metrics(file), 1)],
@@ -97,19 +98,21 @@ def read(path: Path) -> RunRecord:
     )
 
 
-def _went_on(facts: dict[str, Any]) -> dict[str, Any]:
+def _went_on(where: str, facts: dict[str, Any]) -> dict[str, Any]:
     """Returns as a setting what was changed while a run was trained, {} if nothing was.
 
     A run that went on with other settings, or other code of its own, is not one that had them from
     the start. The library's code, versions and devices are conditions: `compare` names them.
     """
-    found = [
-        f"{line} after update {change.get('after_update')}"
-        for change in facts.get("allowed_changes", [])
-        for line in change.get("changes", [])
-        if line.startswith(("settings.", "experiment.py", "source."))
-        and not line.startswith("source.purerl.")
-    ]
+    of_training = ("settings.", "experiment.py", "source.")
+    of_none = ("source.purerl.", *(f"settings.{name}" for name in NOT_LEARNING))
+    found = []
+    changes = {"allowed_changes": [], **facts}
+    for change in check_object(where, changes, allowed_changes=list)["allowed_changes"]:
+        known = check_object(where, change, after_update=int, changes=list)
+        lines = [str(line) for line in known["changes"]]
+        told = [x for x in lines if x.startswith(of_training) and not x.startswith(of_none)]
+        found += [f"{line} after update {known['after_update']}" for line in told]
     return {"went_on_with": "; ".join(found)} if found else {}
 
 

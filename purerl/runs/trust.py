@@ -39,6 +39,7 @@ def load_copy(folder: Path, name: str, original: Path, trust: bool) -> Source:
             f"{folder} holds code of its own, experiment.py, that is not known on this machine: "
             "read it, then add --trust (in Python: trust=True)."
         )
+    # A project may have been moved or renamed since: who vouches again says that it is here now.
     if not any(place.is_file() for place in places) and (trust or not places):
         places = [original if original.is_file() else copy.resolve()]
         remember(text, places[0])

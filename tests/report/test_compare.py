@@ -13,7 +13,7 @@ from scipy import stats
 
 from purerl import compare, run
 from purerl.core.errors import FAILURE, USAGE
-from purerl.report import run_reader
+from purerl.report import comparison, run_reader
 
 ROOT = Path(__file__).parent.parent.parent
 TOY = ROOT / "tests" / "runs" / "toy_experiment.py"
@@ -156,6 +156,27 @@ def test_below_five_seeds_there_is_no_interval_and_it_says_so(tmp_path, capsys):
     assert "No interval (-) below 5 seeds" in capsys.readouterr().out
 
 
+def test_the_picture_says_which_intervals_it_has_and_what_thin_lines_are(tmp_path, monkeypatch):
+    pyplot = comparison.plotter()
+    make_seeds(tmp_path / "runs", "few", [1.0, 2.0, 3.0])
+    make_seeds(tmp_path / "runs", "many", [1.0, 2.0, 3.0, 4.0, 5.0], rate=1.0)
+    titles = []
+    with monkeypatch.context() as patch:
+        patch.setattr(pyplot, "close", lambda figure: None)
+        for names in ("few*", "many*", "*"):
+            found(tmp_path, tmp_path / "runs" / names)
+            (axes,) = pyplot.gcf().axes
+            legend = [text.get_text() for text in axes.get_legend().get_texts()]
+            titles.append(axes.get_title())
+            assert len(axes.collections) == (names != "few*") and legend[-1] == "each run"
+    pyplot.close("all")
+    assert titles == [
+        "Interquartile mean (no intervals below 5 seeds)",
+        "Interquartile mean, 95% intervals",
+        "Interquartile mean, 95% intervals where there are 5 seeds or more",
+    ]
+
+
 def test_failed_runs_count_and_unfinished_ones_do_not(tmp_path, capsys):
     runs = tmp_path / "runs"
     make_seeds(runs, "a", [10.0, 11.0, 12.0])
@@ -246,6 +267,7 @@ def test_a_run_that_went_on_with_other_settings_is_another_one(tmp_path, capsys)
 
 def test_a_run_that_went_on_under_other_conditions_promises_no_bits(tmp_path, capsys):
     changes = ("versions.jax: 1 -> 2", "source.purerl.ppo.losses: a -> b")
+    changes += ("settings.evaluation.number: 10 -> 20",)
     make_run(tmp_path / "runs" / "a", 1, [1.0] * 4, digests=["d1"])
     make_run(tmp_path / "runs" / "b", 1, [1.0] * 4, digests=["e1"], **went_on(*changes))
     result = found(tmp_path, tmp_path / "runs", code=0)
@@ -348,6 +370,10 @@ def test_broken_files_are_named(tmp_path, capsys):
     (folder / "manifest.json").write_text("{")
     assert compare.main([str(folder)]) == USAGE
     assert "manifest.json" in only_line(capsys)
+    for broken in ("{}", "[3]", '[{"after_update": "x"}]', '[{"after_update": 1, "changes": 3}]'):
+        (folder / "manifest.json").write_text(f'{{"allowed_changes": {broken}}}')
+        assert compare.main([str(folder)]) == USAGE
+        assert "manifest.json" in only_line(capsys)
     (folder / "manifest.json").write_text("{}")
     (folder / "config.json").write_text('{"experiment": "x"}')
     assert compare.main([str(folder)]) == USAGE
