@@ -89,10 +89,9 @@ def available() -> dict[str, Path]:
 
 def _has_experiment(path: Path) -> bool:
     """Tells whether a file defines an experiment, as other scripts, or an editor's link, do not."""
-    try:
+    text = b""
+    with contextlib.suppress(OSError):
         text = path.read_bytes()
-    except OSError:
-        return False
     return re.search(rb"^experiment(: *Experiment)? = ", text, re.MULTILINE) is not None
 
 
