@@ -234,8 +234,10 @@ def draw_curves(path: Path, curves: Sequence[Curve], metric: str) -> None:
     axes.set(xlabel="control steps", ylabel=printable(metric), title=curves_title(curves))
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
-    figure.savefig(path, dpi=120)
-    pyplot.close(figure)
+    try:
+        figure.savefig(path, dpi=120)
+    finally:  # a notebook would draw what is left open
+        pyplot.close(figure)
 
 
 def curves_title(curves: Iterable[Curve]) -> str:

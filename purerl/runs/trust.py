@@ -41,7 +41,9 @@ def load_copy(folder: Path, name: str, original: Path, trust: bool) -> Source:
         )
     # A project may have been moved or renamed since: who vouches again says that it is here now.
     if not any(place.is_file() for place in places) and (trust or not places):
-        places = [original if original.is_file() else copy.resolve()]
+        here = Path(f"{name}.py").absolute()  # the user's own folder, which moved with its runs
+        found = here if here.is_file() and here.read_bytes() == text else copy.resolve()
+        places = [original if original.is_file() else found]
         remember(text, places[0])
     # What the code reads beside `__file__` is as trusted as the code, so the folder has no say.
     there = [place for place in places if place.is_file()] or places

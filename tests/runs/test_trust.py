@@ -2,6 +2,7 @@
 
 # ruff: noqa: F811 (fixtures of another file)
 import hashlib
+import json
 import py_compile
 import sys
 from pathlib import Path
@@ -129,6 +130,24 @@ def test_with_trust_what_stood_beside_a_file_that_is_gone_is_looked_for_in_the_r
     ]
     here = str((given / "experiment.py").resolve())
     assert places == [str(gone), here, here]
+
+
+def test_with_trust_a_project_that_moved_with_its_runs_is_found_from_its_folder(
+    given, home, tmp_path, monkeypatch
+):
+    name = json.loads((given / "config.json").read_text())["experiment"]
+    change(given / "manifest.json", experiment_file=str(tmp_path / "renamed_since" / f"{name}.py"))
+    (tmp_path / "project").mkdir()
+    monkeypatch.chdir(tmp_path / "project")
+    file = Path(f"{name}.py")
+    for text, place in [
+        (b"other = 1\n", given / "experiment.py"),  # another file of that name
+        ((given / "experiment.py").read_bytes(), file),
+    ]:
+        file.write_bytes(text)
+        loaded = purerl.load(given, trust=True).experiment.build_env.__globals__
+        assert loaded["__file__"] == str(place.absolute())
+        (home / "purerl" / "trusted").unlink()
 
 
 def test_a_link_to_a_run_is_a_run_and_a_link_to_code_is_none(given, tmp_path, capsys):
