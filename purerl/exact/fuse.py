@@ -123,6 +123,8 @@ def _rounds(params: dict, inputs: Sequence) -> int | None:
     Its condition fails when a counter reaches a literal, or earlier for other reasons; each round
     adds 1 to the counter, which starts from a known number.
     """
+    if params["cond_jaxpr"].out_avals[0].shape:
+        return None  # of a vmapped loop each lane has a counter: `walk` runs it until all are over
     n, m = params["cond_nconsts"], params["body_nconsts"]
     test, body = params["cond_jaxpr"].jaxpr, params["body_jaxpr"].jaxpr
     starts, counters = inputs[n + m :], body.invars[m:]

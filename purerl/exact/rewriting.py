@@ -16,7 +16,8 @@ def rewrite(f: Callable, *, platform: str | None = None, fuse: bool = True) -> C
 
     It is traced once for each set of shapes, as by `jax.jit`, and can be called from any JAX code.
     The derivative of `rewrite(f)` has the right values, but the order of its own sums is fixed only
-    in `rewrite(jax.grad(f))`.
+    in `rewrite(jax.grad(f))`. `rewrite(jax.vmap(f))` has the values of `jax.vmap(rewrite(f))`, but
+    less of what `fuse` does: loops that count and linear systems stay as they are.
 
     Args:
       f: a pure function of pytrees of arrays. Indices of its sums have to follow from constants:

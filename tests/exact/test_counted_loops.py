@@ -1,11 +1,17 @@
 """Loops that count to a constant become scans with the same results; others stay as they are."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
+from mujoco import mjx
 
+from purerl import exact
 from purerl.exact.traces import equations, has_loop
+from tests import quick
 from tests.exact import rewritten
 
 LIMIT = 5
@@ -40,6 +46,34 @@ def test_a_counted_loop_becomes_a_scan_that_stops_where_the_loop_did():
     assert np.unique(want[0]).size > 2 and want[0].max() == LIMIT
     for a, b in zip(got, want, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_a_vmapped_loop_is_rewritten_to_the_same_bits():
+    """Each lane has a counter of its own, which stands still when the lane is over."""
+    x = jnp.array([1.0, 2.0, 50.0, 1e6])
+    alone, together = jax.vmap(exact.rewrite(newton))(x), exact.rewrite(jax.vmap(newton))(x)
+    assert np.unique(together[0]).size > 2
+    for a, b, c in zip(alone, together, jax.vmap(newton)(x), strict=True):
+        np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(b, c)
+
+
+BALL = """<mujoco><option iterations="10"/><worldbody><geom type="plane" size="1 1 1"/>
+<body pos="0 0 0.1"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.slow
+def test_a_vmapped_step_of_mjx_is_rewritten():
+    model = mjx.put_model(mujoco.MjModel.from_xml_string(BALL), impl="jax")
+    data = mjx.make_data(model, impl="jax")
+    batch = jax.vmap(lambda z: data.replace(qpos=data.qpos.at[2].add(z)))(jnp.array([0.0, -0.01]))
+    step = functools.partial(mjx.step, model)
+    alone, together = (
+        quick.jit(f)(batch).qvel
+        for f in (jax.vmap(exact.rewrite(step)), exact.rewrite(jax.vmap(step)))
+    )
+    assert abs(alone[0] - alone[1]).max() > 0.01
+    np.testing.assert_allclose(alone, together, rtol=1e-5, atol=1e-6)
 
 
 def test_only_the_optimisation_makes_scans_of_loops():
