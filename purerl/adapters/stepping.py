@@ -1,5 +1,6 @@
 """One environment, or several, stepped from Python: what the adapters to other libraries share."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 from purerl.core.env import Env, State
 from purerl.core.errors import UserError
 from purerl.core.records import Array, PyTree
+from purerl.physics import drawing
 from purerl.ppo.rollout import is_lost
 
 
@@ -57,25 +59,30 @@ def check_length(episode_length: int) -> int:
     return episode_length
 
 
-class Picture:
-    """Draws an environment that has a model, by MuJoCo's renderer."""
+class Drawer:
+    """Draws an environment that has a model, by MuJoCo's renderer, as a video of a run shows it."""
 
     def __init__(self, env: Env, height: int = 480, width: int = 640) -> None:
-        """Prepares a picture [height, width, 3]; UserError if there is no model to draw."""
+        """Prepares pictures [height, width, 3]; UserError if there is no model to draw."""
         model = getattr(getattr(env, "physics", None), "model", None)
         if model is None:
             raise UserError("This environment cannot be drawn: it has no physics.model.")
         height = min(height, model.vis.global_.offheight)
         width = min(width, model.vis.global_.offwidth)
-        self.data, self.model = mujoco.MjData(model), model
-        self.renderer = mujoco.Renderer(model, height, width)
+        self.stage = drawing.Stage(model)
+        self.renderer = mujoco.Renderer(self.stage.model, height, width)
+        self._take = jax.jit(functools.partial(drawing.take_picture, env))
 
-    def draw(self, physics: Any) -> np.ndarray:
-        """Returns the picture of a simulation's state, uint8 [height, width, 3]."""
-        self.data.qpos, self.data.qvel = physics.qpos, physics.qvel
-        self.data.mocap_pos, self.data.mocap_quat = physics.mocap_pos, physics.mocap_quat
-        mujoco.mj_forward(self.model, self.data)
-        self.renderer.update_scene(self.data, camera=-1 if not self.model.ncam else 0)
+    def begin_episode(self) -> None:
+        """Lets the camera take its height and distance anew."""
+        self.stage.begin_episode()
+
+    def draw(self, state: State) -> np.ndarray:
+        """Returns the picture of a state, uint8 [height, width, 3]."""
+        picture = jax.device_get(self._take(state))
+        self.stage.pose(picture)
+        self.renderer.update_scene(self.stage.data, self.stage.camera)
+        drawing.add_scenery(self.renderer.scene, picture.scenery)
         return self.renderer.render()
 
     def close(self) -> None:

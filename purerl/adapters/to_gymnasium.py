@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from purerl.adapters.stepping import Picture, check_length, example, sound_step, to_numpy
+from purerl.adapters.stepping import Drawer, check_length, example, sound_step, to_numpy
 from purerl.core.env import Env, State
 from purerl.core.records import Array, PyTree
 
@@ -42,7 +42,7 @@ class GymnasiumEnv(gymnasium.Env):
         self.observation_space, self.action_space = spaces(env)
         self.metadata = self.metadata | {"render_fps": round(1 / env.control_timestep)}
         self.render_mode = render_mode
-        self.picture = Picture(env) if render_mode else None
+        self.drawer = Drawer(env) if render_mode else None
         self._reset, self._step = jax.jit(env.reset), jax.jit(sound_step(env))
 
     def reset(
@@ -51,6 +51,8 @@ class GymnasiumEnv(gymnasium.Env):
         """Starts an episode; the same seed starts the same."""
         super().reset(seed=seed)
         self.state, self.steps = self._reset(new_key(self.np_random)), 0
+        if self.drawer:
+            self.drawer.begin_episode()
         return to_numpy(self.state.observation), _info(self.state)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -65,12 +67,12 @@ class GymnasiumEnv(gymnasium.Env):
 
     def render(self) -> Any:
         """Returns the picture, uint8 [H, W, 3]; None without a render mode."""
-        return self.picture.draw(self.state.physics) if self.picture else None
+        return self.drawer.draw(self.state) if self.drawer else None
 
     def close(self) -> None:
         """Frees what OpenGL holds."""
-        if self.picture:
-            self.picture.close()
+        if self.drawer:
+            self.drawer.close()
 
 
 def _info(state: State) -> dict[str, Any]:

@@ -2,5 +2,5 @@
 
 A new engine belongs here. May import: core, exact.
 Read: interface, then the engine you use (engine_c, engine_mjx, engine_warp). `lookup` finds bodies,
-joints and sensors by name.
+joints and sensors by name; `drawing` says how a state looks.
 """

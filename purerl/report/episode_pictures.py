@@ -1,37 +1,18 @@
-"""Episodes as pictures: how each state that the deterministic policy came to looked.
-
-An environment that can be drawn has `physics: Physics`, and its states a PhysicsState as `physics`.
-It may have two methods:
-
-- `model_changes(state) -> {field: array}`: the model fields of this episode, as its own `step`
-  gives them to `Physics.step`. They are drawn as they were.
-- `scenery(state) -> (centers [P, 3], half_sizes [P, 3])` [m]: boxes that belong to the episode but
-  are not all in the model at once, such as the far platforms of a corridor. Only drawn.
-"""
+"""Episodes as pictures: how each state that the deterministic policy came to looked."""
 
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from purerl.core.env import State
 from purerl.core.records import Array, TrainState
+from purerl.physics.drawing import Picture, take_picture
 from purerl.report.episode_arrays import play
 from purerl.runs.build_experiment import Setup
 
 MAX_FRAMES_PER_SECOND = 50.0
-
-
-class Picture(NamedTuple):
-    """All that decides how one state looks; leading axes are the caller's."""
-
-    qpos: Array  # [..., nq]
-    mocap_pos: Array  # [..., nmocap, 3] [m]
-    mocap_quat: Array  # [..., nmocap, 4]
-    changes: dict[str, Array]  # MjModel field -> its values
-    scenery: tuple[Array, ...]  # () or centers and half sizes of boxes, [..., P, 3] each [m]
 
 
 class Recording(NamedTuple):
@@ -52,14 +33,6 @@ def record(setup: Setup, state: TrainState, key: Array, number: int, steps: int)
     # A lost state is not drawn: it has numbers that no camera can point at.
     shown = jnp.concatenate([jnp.ones((1, number), bool), rows["running"]])
     return Recording(pictures, shown, end.episode.episode_return, end.episode.length, end.over)
-
-
-def take_picture(env: Any, state: State) -> Picture:
-    """Keeps what decides how one environment's state looks."""
-    changes = env.model_changes(state) if hasattr(env, "model_changes") else {}
-    scenery = env.scenery(state) if hasattr(env, "scenery") else ()
-    physics = state.physics
-    return Picture(physics.qpos, physics.mocap_pos, physics.mocap_quat, changes, tuple(scenery))
 
 
 def frame_stride(control_timestep: float) -> int:

@@ -207,6 +207,50 @@ def test_it_is_drawn():
     assert done.stdout == "(480, 640, 3) True 0 True\n", done.stderr
 
 
+DRAW_GAPS = """
+import os
+from purerl.report.opengl import choose_gl
+os.environ["MUJOCO_GL"] = choose_gl()
+import jax
+import numpy as np
+from envs import run
+from purerl import adapters
+from purerl.physics.drawing import default_camera
+env = run.build(run.Options(arena="gaps"), "c")
+drawn = adapters.gymnasium_env(env, render_mode="rgb_array")
+boxes = list(env.parts.boxes.boxes)
+for seed in (0, 1):
+    drawn.drawer.stage.followed_height = 5.0  # of the episode before
+    drawn.reset(seed=seed)
+    print(drawn.drawer.stage.followed_height is None)
+    drawn.step(np.zeros(env.action_size))
+    drawn.render()
+    true = env.model_changes(drawn.state)
+    data, model = drawn.drawer.stage.data, drawn.drawer.stage.model
+    # Where they are drawn, not where a model would put them.
+    print(abs(data.geom_xpos[boxes] - true["geom_pos"][np.array(boxes)]).max() < 1e-6)
+    print(abs(model.geom_size[boxes] - true["geom_size"][np.array(boxes)]).max() < 1e-6)
+    print(abs(true["geom_pos"] - env.physics.model.geom_pos).max() > 1)
+    scene, course = drawn.drawer.renderer.scene, env.scenery(drawn.state)[0]
+    far = [scene.geoms[scene.ngeom - len(course) + i].pos for i in range(len(course))]
+    print(abs(np.array(far) - course).max() < 1e-5)
+    eyes = np.mean([eye.pos for eye in scene.camera], axis=0)
+    print(abs(eyes - data.cam_xpos[default_camera(model)]).max() < 1e-5)
+print(default_camera(model) != 0)
+print(env.physics.model.geom_sameframe.any())  # it is a copy that is drawn
+"""
+
+
+def test_the_gaps_are_drawn_where_physics_has_them():
+    pytest.importorskip("gymnasium")
+    done = subprocess.run(
+        [sys.executable, "-c", DRAW_GAPS], capture_output=True, text=True, cwd=ROOT
+    )
+    if "There is no OpenGL" in done.stderr:
+        pytest.skip("no OpenGL here")
+    assert done.stdout.split() == ["True"] * 14, done.stderr
+
+
 # --- the page ---
 
 PYTHON = blocks(PAGES["docs/howto/adapters.md"].read_text(), "python")

@@ -18,6 +18,7 @@ from envs import cartpole_swingup
 from purerl import render, run
 from purerl.core.errors import FAILURE, USAGE, RunError
 from purerl.core.keys import per_environment
+from purerl.physics.drawing import default_camera, root_body
 from purerl.report import episode_pictures, opengl, renderer as drawing, video
 from purerl.runs.policy import Policy
 from purerl.runs.restored_run import restore
@@ -244,7 +245,7 @@ def test_furniture_is_not_what_the_camera_follows():
     model = mujoco.MjModel.from_xml_string(
         f"<mujoco><worldbody>{shelf}{robot}</worldbody></mujoco>"
     )
-    assert model.body(drawing.root_body(model)).name == "robot"
+    assert model.body(root_body(model)).name == "robot"
 
 
 def test_the_camera_follows_a_free_body_along_the_ground():
@@ -273,7 +274,7 @@ def test_the_camera_follows_a_free_body_along_the_ground():
 )
 def test_the_default_camera_is_the_one_that_follows(joint, cameras, expected):
     model = room(joint, cameras)
-    chosen = drawing.default_camera(model)
+    chosen = default_camera(model)
     assert (None if chosen is None else model.camera(chosen).name) == expected
 
 

@@ -1,0 +1,133 @@
+"""How a state looks: what of it is put into MuJoCo's model and scene before a picture is drawn.
+
+An environment that can be drawn has `physics: Physics`, and its states a PhysicsState as `physics`.
+It may have two methods:
+
+- `model_changes(state) -> {field: array}`: the model fields of this episode, as its own `step`
+  gives them to `Physics.step`. They are drawn as they were.
+- `scenery(state) -> (centers [P, 3], half_sizes [P, 3])` [m]: boxes that belong to the episode but
+  are not all in the model at once, such as the far platforms of a corridor. Only drawn.
+
+OpenGL is the caller's.
+"""
+
+import copy
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from purerl.core.env import State
+from purerl.core.records import Array
+from purerl.physics.lookup import find, names
+
+
+class Picture(NamedTuple):
+    """All that decides how one state looks; leading axes are the caller's."""
+
+    qpos: Array  # [..., nq]
+    mocap_pos: Array  # [..., nmocap, 3] [m]
+    mocap_quat: Array  # [..., nmocap, 4]
+    changes: dict[str, Array]  # MjModel field -> its values
+    scenery: tuple[Array, ...]  # () or centers and half sizes of boxes, [..., P, 3] each [m]
+
+
+def take_picture(env: Any, state: State) -> Picture:
+    """Keeps what decides how one environment's state looks."""
+    changes = env.model_changes(state) if hasattr(env, "model_changes") else {}
+    scenery = env.scenery(state) if hasattr(env, "scenery") else ()
+    physics = state.physics
+    return Picture(physics.qpos, physics.mocap_pos, physics.mocap_quat, changes, tuple(scenery))
+
+
+class Stage:
+    """A copy of a model, its data and a camera, posed as each picture says."""
+
+    def __init__(self, model: mujoco.MjModel, camera: str = "") -> None:
+        """Copies the model. ValueError if there is no such camera; "": `default_camera`."""
+        self.model = model = copy.copy(model)
+        # The compiler marks geoms that coincide with their body, and MuJoCo then never reads their
+        # own place, so that a changed one would not show.
+        model.geom_sameframe[:] = model.site_sameframe[:] = model.body_sameframe[:] = 0
+        self.data = mujoco.MjData(model)
+        self.fixed = find(model, "camera", camera) if camera else default_camera(model)
+        self.camera = mujoco.MjvCamera()
+        self.root = root_body(model)
+        self.followed_height: float | None = None
+
+    def begin_episode(self) -> None:
+        """Lets the camera take its height and distance anew."""
+        self.followed_height = None
+
+    def pose(self, picture: Picture) -> None:
+        """Puts everything where it is in a picture, given as numpy arrays, and aims the camera."""
+        for name, values in picture.changes.items():
+            getattr(self.model, name)[...] = values
+        self.data.qpos[:] = picture.qpos
+        self.data.mocap_pos[:] = picture.mocap_pos
+        self.data.mocap_quat[:] = picture.mocap_quat
+        mujoco.mj_fwdPosition(self.model, self.data)
+        self._aim()
+
+    def _aim(self) -> None:
+        """Points the camera at the followed body, or leaves it to the model."""
+        if self.fixed is not None:
+            self.camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+            self.camera.fixedcamid = self.fixed
+            return
+        center = self.data.subtree_com[self.root]
+        if self.followed_height is None:
+            # The height stays that of the episode's start, or the ground would bob with each step.
+            self.followed_height = float(center[2])
+            own = self.model.body_rootid[self.model.geom_bodyid] == self.root
+            away = np.linalg.norm(self.data.geom_xpos[own] - center, axis=1)
+            radius = np.max(away + self.model.geom_rbound[own], initial=0.01)  # [m]
+            # A view of 45 degrees is as high as 0.8 of the distance: room for body and ground.
+            self.camera.distance = 3.2 * radius
+        self.camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+        self.camera.azimuth, self.camera.elevation = 90.0, -15.0  # from the side: x to the right
+        self.camera.lookat[:] = center[0], center[1], self.followed_height
+
+
+def add_scenery(scene: mujoco.MjvScene, scenery: tuple[Array, ...]) -> None:
+    """Adds a picture's boxes to a scene that MuJoCo has updated."""
+    for center, half_size in zip(*scenery, strict=True) if scenery else ():
+        _add_box(scene, np.asarray(center, float), np.asarray(half_size, float))
+
+
+def _add_box(scene: mujoco.MjvScene, center: np.ndarray, half_size: np.ndarray) -> None:
+    if scene.ngeom >= scene.maxgeom:
+        return
+    # 2 mm smaller: where the model has the same box, its surface and not this one is seen.
+    half_size = np.maximum(half_size - 0.002, 1e-4)
+    geom, box = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_BOX
+    color = np.array([0.4, 0.45, 0.5, 1.0], np.float32)
+    mujoco.mjv_initGeom(geom, box, half_size, center, np.eye(3).ravel(), color)
+    scene.ngeom += 1
+
+
+def default_camera(model: mujoco.MjModel) -> int | None:
+    """Returns the id of the camera that shows the body best; None: follow it from the side.
+
+    Where something can travel (a free or slide joint), a camera that tracks a body, best one named
+    "side" or "track". Else, but for free bodies, the first camera that stands in the world.
+    """
+    modes, joints = mujoco.mjtCamLight, set(model.jnt_type.tolist())
+    tracks = (int(modes.mjCAMLIGHT_TRACK), int(modes.mjCAMLIGHT_TRACKCOM))
+    tracking = [i for i in range(model.ncam) if model.cam_mode[i] in tracks]
+    called = names(model, "camera")
+    named = [i for i in tracking if "side" in called[i] or "track" in called[i]]
+    free, slide = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+    if tracking and joints & {free, slide}:
+        return (named or tracking)[0]
+    if free in joints:
+        return None
+    return next((i for i in range(model.ncam) if model.cam_bodyid[i] == 0), None)
+
+
+def root_body(model: mujoco.MjModel) -> int:
+    """Returns the child of the world with the most moving bodies; the heaviest of equals."""
+    below = [0] * model.nbody
+    for body in range(1, model.nbody):
+        below[model.body_rootid[body]] += int(model.body_weldid[body] != 0)
+    return max(range(model.nbody), key=lambda i: (below[i], model.body_subtreemass[i]))
