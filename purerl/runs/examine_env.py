@@ -18,6 +18,7 @@ from purerl.runs.check_env import (
     check_steps_repeat,
     try_out,
 )
+from purerl.runs.check_traces import check_traces
 from purerl.runs.findings import Finding, error, ok, some, warning
 from purerl.runs.state_arrays import flatten
 from purerl.runs.user_code import in_words, own_line
@@ -46,18 +47,21 @@ def examine(env: Env, num_steps: int = NUM_STEPS) -> Iterator[Finding]:
     except Exception as failed:
         yield error("steps", f"it cannot be stepped: {in_words(failed)}{own_line(failed)}")
         return
+    yield check_repeats(env, trial)
     yield from check_trial(trial)
     yield from check_controls(env, trial)
     yield from check_placed(env)
 
 
+def check_repeats(env: Env, trial: Trial) -> Finding:
+    """Tells whether the environment does the same twice: in one program, and in two."""
+    checks = ((check_traces, env), (check_keys_repeat, trial), (check_steps_repeat, trial))
+    twice = [_told("same twice", "reset and step", error, *check) for check in checks]
+    return next((one for one in twice if one.level != "ok"), twice[0])
+
+
 def check_trial(trial: Trial) -> Iterator[Finding]:
     """Yields what is found in what environments did."""
-    twice = [
-        _told("same twice", "reset and step", error, check, trial)
-        for check in (check_keys_repeat, check_steps_repeat)
-    ]
-    yield next((one for one in twice if one.level != "ok"), twice[0])
     yield check_keys(trial.start)
     broken = not_finite(trial)
     yield broken
@@ -117,20 +121,26 @@ def not_finite(trial: Trial) -> Finding:
         wrong = ~(np.abs(values) <= ABSURD)  # a NaN fails the comparison
         if not wrong.any():
             continue
-        when = (
-            "after every step"
-            if wrong[1:].reshape(-1, wrong[0, 0].size).any(1).all()
-            else "at times"
-        )
         entries = wrong.any((0, 1))
         where = f"[{some([str(i) for i in np.flatnonzero(entries)])}]" if entries.ndim else ""
-        what = f"{np.abs(values).max():.3g}" if np.isfinite(values).all() else "not finite"
-        found.append(f"{name}{where} is {what} {when}")
+        found.append(f"{name}{where} is {_when(values, wrong, trial.actions)}")
     if found:
         # Metrics are the reward's terms, and say most.
         found.sort(key=lambda line: not line.startswith("metrics"))
         return error("finite", f"{some(found)}; such an episode is lost.")
     return ok("finite", f"every number, in {trial.actions.shape[0]} steps of random actions")
+
+
+def _when(values: np.ndarray, wrong: np.ndarray, actions: Any) -> str:
+    """Tells the first of the wrong values [1 + T, B, ...], and which action brought it."""
+    first = tuple(np.argwhere(wrong)[0])
+    step, number = first[0], len(values) - 1
+    if wrong[1:].reshape(number, -1).any(1).all():
+        return f"{values[first]:.3g} after every step"
+    if step == 0:
+        return f"{values[first]:.3g} when reset returns"
+    action = some([f"{x:.3g}" for x in np.asarray(actions[step - 1, first[1]])])
+    return f"{values[first]:.3g} for the first time at step {step} of {number}, by [{action}]"
 
 
 def _leaves(trial: Trial) -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -1,5 +1,6 @@
 """Checks of a network on real observations: is it finite, and does it use what it is given?"""
 
+import functools
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,6 +11,8 @@ import numpy as np
 from purerl.core.records import Array, Network, PyTree
 from purerl.runs.findings import Finding, error, ok, some, warning
 from purerl.runs.state_arrays import flatten
+
+STEP = 0.01  # std of what is added to parameters, for a look at the network after a first step
 
 
 def examine(network: Network, observation: PyTree) -> Iterator[Finding]:
@@ -25,19 +28,39 @@ def examine(network: Network, observation: PyTree) -> Iterator[Finding]:
     inputs = jax.tree.map(_normalize, observation)
     number = jax.tree.leaves(inputs)[0].shape[0]
     memory = jax.tree.map(lambda x: jnp.zeros((number, *x.shape), x.dtype), carry)
-    answers, gradients = jax.jit(_probe, static_argnums=0)(network, params, inputs, memory)
-    (loc, scale, value), following = answers
+    probe = functools.partial(jax.jit(_probe, static_argnums=0), network)
+    answers, gradients = probe(params, inputs, memory)
+    (_, following), moved = probe(_moved(params), inputs, memory)
+    _, scale, value = answers[0]
     broken = [n for n, x in zip(("loc", "scale", "value"), answers[0], strict=True) if _bad(x)]
     if broken:
-        yield error("outputs", f"{some(broken)} is not finite for observations of mean 0, std 1.")
+        what = f"{_are(broken)} not finite for observations of mean 0, std 1."
+        yield error("outputs", what)
         return
     if not (np.asarray(scale) > 0).all():
         yield error("outputs", "scale is not above 0 everywhere: take softplus or exp of it.")
         return
     yield ok("outputs", f"value {np.min(value):.2g} to {np.max(value):.2g}, finite")
     yield from _check_memory(memory, following)
-    yield from _check_inputs(*gradients[:2])
-    yield _check_parameters(gradients[2])
+    yield from _check_inputs(*moved[:2])
+    yield _check_parameters(gradients[2], moved[2])
+
+
+def _moved(params: PyTree) -> PyTree:
+    """Returns parameters as a first step of training might leave them.
+
+    A layer that begins with zeros, as the last of a residual block often does, hides all before it
+    until then.
+    """
+    leaves, tree = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.key(0), len(leaves))
+    pairs = zip(keys, leaves, strict=True)
+    moved = [x + STEP * jax.random.normal(k, x.shape, x.dtype) for k, x in pairs]
+    return jax.tree.unflatten(tree, moved)
+
+
+def _are(names: list[str]) -> str:
+    return f"{some(names)} {'is' if len(names) == 1 else 'are'}"
 
 
 def _normalize(x: Array) -> Array:
@@ -103,12 +126,14 @@ def _observations(names: list[str]) -> str:
     return some([f"observation[{name!r}]" if name else "the observation" for name in names])
 
 
-def _check_parameters(gradients: PyTree) -> Finding:
-    found = flatten(gradients)
+def _check_parameters(gradients: PyTree, moved: PyTree) -> Finding:
+    """Tells which gradients are not finite at first, and which are zero after a step too."""
+    found, later = flatten(gradients), flatten(moved)
     broken = [name for name, x in found.items() if _bad(x)]
     if broken:
         return error("gradients", f"of {some(broken)} are not finite.")
-    idle = [name for name, x in found.items() if not x.any()]
+    idle = [name for name, x in later.items() if not x.any()]
     if idle:
-        return warning("gradients", f"{some(idle)} has none: it is never trained.")
+        what = "has none: it is" if len(idle) == 1 else "have none: they are"
+        return warning("gradients", f"{some(idle)} {what} never trained.")
     return ok("gradients", f"each of {len(found)} parameters has one")

@@ -47,6 +47,23 @@ class NanTerm(Toy):
         return super().step(state, action).replace(metrics={"distance": term})
 
 
+class NanLate(Toy):
+    """When a full action is met, the third of those that are tried."""
+
+    def step(self, state, action):
+        return super().step(state, action).replace(reward=jnp.log(1.0 - action[0]))
+
+
+class NanStart(Toy):
+    def reset(self, key):
+        return super().reset(key).replace(reward=jnp.float32(jnp.inf))
+
+
+class NumpyRandom(Toy):
+    def step(self, state, action):
+        return toy_state(state.physics + 0.1 * action + 0.1 * np.random.randn())
+
+
 class OverAtOnce(Toy):
     def reset(self, key):
         return super().reset(key).replace(terminated=jnp.ones((), bool))
@@ -118,7 +135,14 @@ class WrongReward(Toy):
     [
         (Counting(), "own state", "error: reset or step sets env.calls"),
         (Deaf(), "keys", "warning: physics, observation and task are the same"),
-        (NanTerm(), "finite", "error: metrics/distance is not finite after every step"),
+        (NanTerm(), "finite", "error: metrics/distance is nan after every step"),
+        (
+            NanLate(),
+            "finite",
+            "error: reward is -inf for the first time at step 3 of 23, by [1, 1];",
+        ),
+        (NanStart(), "finite", "error: reward is inf when reset returns; such"),
+        (NumpyRandom(), "same twice", "error: step is another program when it is traced again:"),
         (OverAtOnce(), "ends", "error: 16 of 16 episodes have ended when reset returns"),
         (OneStep(), "ends", "error: every episode ends at its first step"),
         (NoReward(), "reward", "warning: it is 0 at every one of"),
@@ -265,8 +289,10 @@ ONE = {name: jnp.zeros(x.shape[1:]) for name, x in OBSERVATION.items()}
 class Flaw:
     value_reads: tuple = ("policy", "privileged")
     policy_reads: tuple = ("policy",)
-    idle: bool = False
+    idle: tuple = ()
     nan: bool = False
+    zeros: bool = False  # in the last layers: until they are trained, nothing before them is
+    root: bool = False  # of a parameter that begins at 0, where its slope is infinite
 
 
 class Small(nn.Module):
@@ -275,11 +301,17 @@ class Small(nn.Module):
     @nn.compact
     def __call__(self, observation):
         def read(names):
-            return sum(nn.Dense(1, name=None)(observation[name]) for name in names)
+            parts = [nn.Dense(1)(observation[name]) for name in names]
+            kernel = nn.initializers.zeros if self.flaw.zeros else nn.initializers.ones
+            return (
+                nn.Dense(1, kernel_init=kernel)(sum(parts)) if parts else jnp.full((8, 1), jnp.nan)
+            )
 
         loc, value = read(self.flaw.policy_reads), read(self.flaw.value_reads)[..., 0]
-        if self.flaw.idle:
-            self.param("idle", nn.initializers.ones, (2,))
+        for name in self.flaw.idle:
+            self.param(name, nn.initializers.ones, (2,))
+        if self.flaw.root:
+            value += jnp.sqrt(jnp.abs(self.param("root", nn.initializers.zeros, ())))
         value = jnp.log(-jnp.exp(value)) if self.flaw.nan else value
         scale = jnp.exp(self.param("scale", nn.initializers.zeros, (1,)))
         return PolicyOutput(Normal(loc, jnp.broadcast_to(scale, loc.shape)), value)
@@ -291,8 +323,16 @@ class Small(nn.Module):
         (Flaw(), None, ""),
         (Flaw(value_reads=("policy",)), "inputs", "depend on observation['privileged']"),
         (Flaw(policy_reads=("policy", "privileged")), "inputs", "policy reads observation['priv"),
-        (Flaw(idle=True), "gradients", "params/idle has none: it is never trained"),
-        (Flaw(nan=True), "outputs", "value is not finite"),
+        (Flaw(idle=("a",)), "gradients", "warning: params/a has none: it is never trained"),
+        (
+            Flaw(idle=("a", "b")),
+            "gradients",
+            "params/a, params/b have none: they are never trained",
+        ),
+        (Flaw(nan=True), "outputs", "error: value is not finite"),
+        (Flaw(nan=True, policy_reads=()), "outputs", "error: loc, value are not finite"),
+        (Flaw(zeros=True), None, ""),
+        (Flaw(root=True), "gradients", "error: of params/root are not finite"),
     ],
 )
 def test_a_network(flaw, about, text):
