@@ -118,8 +118,10 @@ class Run:
         from purerl.runs.options import check_seed
 
         check_seed(seed)
-        if not isinstance(episodes, Integral) or episodes < 1:
-            raise UserError(f"episodes is {episodes}; it must be a whole number, at least 1.")
+        if not isinstance(episodes, Integral):
+            raise UserError(f"episodes is {episodes!r}; it must be a whole number.")
+        if episodes < 1:
+            raise UserError(f"episodes is {episodes}; it must be at least 1.")
         config, env, network, engine = self.restored.setup
 
         def judge(state: Any, key: Any) -> dict[str, Any]:
