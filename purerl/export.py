@@ -11,7 +11,6 @@ actions are from the run's own is printed.
 
 import importlib
 import importlib.util
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from typing import Any, Literal
 from purerl.core.errors import UserError
 from purerl.runs.command_errors import leave
 from purerl.runs.command_line import carry_out
+from purerl.runs.files import check_writable
 from purerl.runs.options import PlayOptions
 from purerl.runs.output import show
 
@@ -47,9 +47,7 @@ def command(options: Options) -> None:
     from purerl.runs.loaded_run import load
 
     file = options.out or Path(f"policy.{options.format}")
-    place = file.absolute().parent
-    if not os.access(place, os.W_OK) or file.is_dir():
-        raise UserError(f"{file} cannot be written: is {place} a folder of yours?")
+    check_writable(file)
     write = writer(options.format)
     run = load(options.run, options.checkpoint, options.engine, options.trust)
     policy = write(run, file)

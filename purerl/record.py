@@ -20,8 +20,6 @@ returns from `reward` here. Every array but `length` is [N, T, ...]: N episodes 
 MuJoCo's model, to compute from `qpos` where limbs are, is `purerl.load(RUN).env.physics.model`.
 """
 
-import io
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +27,7 @@ from pathlib import Path
 from purerl.core.errors import UserError
 from purerl.runs.command_errors import leave
 from purerl.runs.command_line import carry_out
-from purerl.runs.files import write_answer
+from purerl.runs.files import check_writable, write_arrays
 from purerl.runs.options import PlayOptions
 from purerl.runs.output import show
 
@@ -51,21 +49,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def command(options: Options) -> None:
     """Writes the file and tells what is in it."""
-    import numpy as np
-
     from purerl.report.episode_arrays import record
     from purerl.runs.loaded_run import load
 
     if options.episodes < 1:
         raise UserError(f"episodes is {options.episodes}; it must be at least 1.")
-    place = options.out.absolute().parent
-    if not os.access(place, os.W_OK) or options.out.is_dir():
-        raise UserError(f"{options.out} cannot be written: is {place} a folder of yours?")
+    check_writable(options.out)
     run = load(options.run, options.checkpoint, options.engine, options.trust)
     arrays = record(run.restored.setup, run.state, options.seed, options.episodes)
-    content = io.BytesIO()
-    np.savez(content, **arrays)  # type: ignore[arg-type]
-    write_answer(options.out, content.getvalue())
+    write_arrays(options.out, arrays)
     show(*(f"{name:32} {x.dtype} {list(x.shape)}" for name, x in arrays.items()), str(options.out))
 
 

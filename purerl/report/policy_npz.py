@@ -1,6 +1,5 @@
 """A policy of a default network as arrays by name; `numpy_policy.py` is their reader."""
 
-import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from purerl.core.errors import UserError
 from purerl.ppo import networks, running_moments
 from purerl.report.numpy_policy import Policy
 from purerl.report.policy_file import control_range, origin
-from purerl.runs.files import write_answer
+from purerl.runs.files import write_arrays
 from purerl.runs.loaded_run import Run
 
 
@@ -22,9 +21,7 @@ def write_npz(run: Run, file: Path) -> Callable[[Any], np.ndarray]:
       UserError: the network is none of `networks.mlp` and `networks.recurrent`.
     """
     arrays = policy_arrays(run)
-    content = io.BytesIO()
-    np.savez(content, **arrays)
-    write_answer(file, content.getvalue())
+    write_arrays(file, arrays)
     policy = Policy(file)
     return lambda observation: policy(networks.policy_features(observation))
 

@@ -163,6 +163,22 @@ def write_answer(path: Path, content: bytes) -> None:
         write_file(path, content)
 
 
+def write_arrays(path: Path, arrays: dict[str, Any]) -> None:
+    """Writes arrays by name as npz, as `write_answer`; by a path numpy would add to its name."""
+    import numpy as np
+
+    content = io.BytesIO()
+    np.savez(content, **arrays)
+    write_answer(path, content.getvalue())
+
+
+def check_writable(path: Path) -> None:
+    """Raises UserError if a file that a person has named could not be written, before the work."""
+    place = path.absolute().parent
+    if not os.access(place, os.W_OK) or path.is_dir():
+        raise UserError(f"{path} cannot be written: is {place} a folder of yours?")
+
+
 def make_folder(path: Path) -> None:
     """Makes a folder, and those above it that are missing."""
     missing = [place for place in (path, *path.parents) if not place.exists()]

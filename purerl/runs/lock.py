@@ -38,22 +38,21 @@ class RunLock:
     def __init__(self, folder: Path, patience: float = PATIENCE) -> None:
         """Makes the folder and locks it; UserError if another process writes it, for so many s."""
         make_folder(folder)
-        self.patience = patience
         self.folder = folder
         self.handles = [os.open(folder, os.O_RDONLY | os.O_DIRECTORY)]
         try:
             self.handles.append(os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o644))
-            self.locks = any(self._try(handle) for handle in self.handles)
+            self.locks = any(self._try(handle, patience) for handle in self.handles)
             os.ftruncate(self.handles[1], 0)
             os.pwrite(self.handles[1], f"{os.getpid()}\n".encode(), 0)
         except BaseException:
             self.close()
             raise
 
-    def _try(self, handle: int) -> bool:
+    def _try(self, handle: int, patience: float) -> bool:
         """Locks a handle; False where the file system has no such lock."""
         try:
-            _lock(handle, self.patience)
+            _lock(handle, patience)
         except BlockingIOError as error:
             owner = os.pread(self.handles[1], 20, 0).decode(errors="replace").strip() or "unknown"
             raise UserError(

@@ -8,6 +8,7 @@ from typing import Any
 
 from purerl.core.errors import UserError
 from purerl.core.records import PyTree
+from purerl.ppo.config import Config
 from purerl.runs import checkpoint, checkpoint_folder, experiment, identity, manifest
 from purerl.runs.experiment import Experiment, Source
 from purerl.runs.files import (
@@ -136,24 +137,17 @@ def begin_or_go_on(
             + f"\n{cure(found)}, train anew under another --name, or go on all the same with "
             "--allow-changes."
         )
-    if found and _is_done(folder, settings):
-        _check_nothing_changed(folder, found)
-    elif found:
+    if found:
+        _check_trains_what_is_new(folder, settings, found)
         checkpoint.check_fits(folder / "checkpoints", abstract)
         _write(folder, source, settings, facts | _noted(folder, old, found))
 
 
-def _is_done(folder: Path, settings: dict[str, Any]) -> bool:
-    """Tells whether a run has all updates that `settings`, of config.json, ask for."""
-    ppo = settings["settings"]["ppo"]
-    planned = ppo["num_steps"] // (ppo["num_envs"] * ppo["rollout_length"])
-    return max(checkpoint_folder.updates(folder / "checkpoints"), default=0) >= planned
-
-
-def _check_nothing_changed(folder: Path, found: list[str]) -> None:
+def _check_trains_what_is_new(folder: Path, settings: dict[str, Any], found: list[str]) -> None:
     """Raises UserError where a run that is done would be given settings that it never had."""
     changed = [line for line in found if line.startswith("settings.")]
-    if changed:
+    planned = Config(**settings["settings"]["ppo"]).num_updates
+    if changed and max(checkpoint_folder.updates(folder / "checkpoints"), default=0) >= planned:
         raise UserError(
             f"The run {folder} has all of its updates, so none would be trained with what is new:"
             "\n  " + "\n  ".join(changed) + "\nRaise --ppo.num-steps, or use another --name."
