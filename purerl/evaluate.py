@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from purerl.core.errors import UserError
 from purerl.runs.command_errors import leave
 from purerl.runs.command_line import carry_out
+from purerl.runs.files import check_writable, write_answer
 from purerl.runs.options import PlayOptions
 from purerl.runs.output import show
 
@@ -34,20 +34,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def command(options: Options) -> None:
-    """Evaluates, writes the file that was asked for, and prints the figures."""
+    """Evaluates, prints the figures, and writes the file that was asked for."""
     from purerl.runs.loaded_run import load
 
     file = options.json
-    if file is not None and not file.absolute().parent.is_dir():
-        raise UserError(f"{file} cannot be written: there is no such folder.")
+    if file is not None:
+        check_writable(file)
     run = load(options.run, options.checkpoint, options.engine, options.trust)
     result = run.evaluate(options.episodes, options.seed, options.stochastic)
-    try:
-        if file is not None:
-            file.write_text(json.dumps(result, indent=2) + "\n")
-    except OSError as error:
-        raise UserError(f"{file} cannot be written: {error.strerror}.") from error
     show(*describe(result))
+    if file is not None:  # last: where the disk is full, the figures are on the screen
+        write_answer(file, (json.dumps(result, indent=2) + "\n").encode())
 
 
 def describe(result: dict[str, Any]) -> list[str]:

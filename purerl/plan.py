@@ -80,12 +80,14 @@ def titles(problems: Sequence[Any]) -> list[str]:
 
 
 def same(some: Any, others: Any) -> bool:
-    """Tells whether two trees of arrays are equal."""
+    """Tells whether two trees of arrays are equal, in structure too."""
     import jax
     import numpy as np
 
-    pairs = zip(jax.tree.leaves(some), jax.tree.leaves(others), strict=True)
-    return all(np.array_equal(a, b) for a, b in pairs)
+    ours, theirs = (dict(jax.tree_util.tree_leaves_with_path(x)) for x in (some, others))
+    return ours.keys() == theirs.keys() and all(
+        np.array_equal(ours[name], theirs[name]) for name in ours
+    )
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 
 from experiments.benchmarks import start_up
-from experiments.benchmarks.output import output_file
+from experiments.benchmarks.output import count, output_file
 from purerl import exact
 from purerl.core.parts import WHOLE
 from purerl.core.records import Array, Network, PyTree, TrainState
@@ -230,7 +230,7 @@ def main(arguments: list[str]) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("experiment", help="as for python -m purerl.run, with its overrides")
-    parser.add_argument("--rounds", type=int, default=5, help="rounds of the measurement")
+    parser.add_argument("--rounds", type=count, default=5, help="rounds of the measurement")
     parser.add_argument("--least-s", type=float, default=1.0, help="least time of a part [s]")
     parser.add_argument(
         "--json", type=output_file, default="", help="also write the figures to this file"

@@ -15,6 +15,7 @@ import jax
 
 from envs.suite.tasks import TASKS, Options as SuiteOptions
 from experiments.benchmarks.benchmark import bare_physics, compile_part, measure
+from experiments.benchmarks.output import count
 from purerl.core.errors import UserError, one_line
 from purerl.ppo import algorithm
 from purerl.ppo.rollout import rollout
@@ -71,7 +72,7 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", default=list(experiments), choices=list(experiments))
     parser.add_argument("--num-envs", type=int, default=0, help="0: its own")
     parser.add_argument("--length", type=int, default=0, help="steps of a rollout; 0: its own")
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--rounds", type=count, default=3)
     options = parser.parse_args()
     print(ROW.format("environment", "engine", "contract", "physics alone", "rollout", "share"))
     print("|---|---|---|---|---|---|", flush=True)

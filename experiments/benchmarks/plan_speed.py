@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.suite.tasks import TASKS
+from experiments.benchmarks.output import count
 from experiments.benchmarks.plan_suite import experiment_of
 from purerl.devices.compilation import set_up_jax
 from purerl.physics import engine_c
@@ -138,7 +139,7 @@ def main() -> int:
     parser.add_argument("--samples", type=int, nargs="+", default=[64])
     parser.add_argument("--horizon", type=int, nargs="+", default=[50])
     parser.add_argument("--side-by-side", type=int, nargs="+", default=[1])
-    parser.add_argument("--steps", type=int, default=20, help="control steps that are timed")
+    parser.add_argument("--steps", type=count, default=20, help="control steps that are timed")
     options = parser.parse_args()
     for name in options.bodies:
         if name not in known:

@@ -25,7 +25,8 @@ import jax
 import numpy as np
 
 from envs.suite.tasks import TASKS, Options as SuiteOptions
-from experiments.benchmarks.output import output_file
+from experiments.benchmarks.output import count, output_file
+from purerl.core.errors import UserError
 from purerl.devices.compilation import set_up_jax
 from purerl.runs.build_experiment import build
 from purerl.runs.command_errors import leave
@@ -45,6 +46,7 @@ OTHER_SETTINGS: dict[str, dict[str, Any]] = {
 PLANNERS = ("predictive_sampling", "mppi", "cem")
 FIGURES = ("return", "length", "lost", "plans_per_s")
 COLUMNS = ("task", "planner", "steps", "seed", "episode", *FIGURES)
+READ = {"task", "planner", "steps", "seed", "return"}  # what a file must have to be gone on with
 
 
 def experiment_of(task: str) -> Experiment:
@@ -100,8 +102,14 @@ def play(task: str, name: str, steps: int, seed: int, number: int) -> list[dict]
 
 
 def read(file: Path) -> list[dict[str, str]]:
-    """Returns the rows that a file has so far."""
-    return list(csv.DictReader(file.open())) if file.exists() else []
+    """Returns the rows that a file has so far; UserError if it is another's."""
+    if not file.exists():
+        return []
+    with file.open(newline="") as opened:
+        rows = csv.DictReader(opened)
+        if missing := READ - set(rows.fieldnames or ()):
+            raise UserError(f"{file} has no column {min(missing)}: name another file with --out.")
+        return list(rows)
 
 
 def table(rows: list[dict[str, str]]) -> list[str]:
@@ -128,8 +136,8 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", default=default, choices=known, metavar="TASK")
     parser.add_argument("--planners", nargs="+", default=PLANNERS, choices=PLANNERS)
     parser.add_argument("--runs", nargs="+", default=[], help="runs' folders, instead of tasks")
-    parser.add_argument("--batches", type=int, default=5, help="each of a seed of its own")
-    parser.add_argument("--side-by-side", type=int, default=2, help="episodes of a batch")
+    parser.add_argument("--batches", type=count, default=5, help="each of a seed of its own")
+    parser.add_argument("--side-by-side", type=count, default=2, help="episodes of a batch")
     parser.add_argument("--steps", type=int, default=0, help="0: the experiment's time limit")
     parser.add_argument("--table", action="store_true", help="play nothing")
     options = parser.parse_args()

@@ -108,11 +108,18 @@ def _seeds_of(rows: Iterable[dict[str, str]]) -> list[Seed]:
 
 
 def merged(sources: Iterable[Iterable[Seed]]) -> list[Seed]:
-    """Returns each seed of a task once, from several sources: of one that two have, the longer."""
+    """Returns each seed of a task once, from several sources: of one that two have, the longer.
+
+    One that is unfinished does not count, so it gives way to any other.
+    """
+
+    def rank(s: Seed) -> tuple[bool, tuple[int, ...]]:
+        return s.status != "unfinished", s.steps[-1:]
+
     found: dict[tuple[str, int], Seed] = {}
     for s in itertools.chain.from_iterable(sources):
         name = (s.task, s.seed)
-        if name not in found or s.steps[-1:] > found[name].steps[-1:]:
+        if name not in found or rank(s) > rank(found[name]):
             found[name] = s
     return sorted(found.values())
 

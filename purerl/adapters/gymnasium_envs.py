@@ -236,7 +236,9 @@ class _Pool:
         return episode.row
 
     def _begin(self, env: gymnasium.Env, seed: np.ndarray) -> np.ndarray:
-        observation, _ = env.reset(seed=int(seed[0]) << 32 | int(seed[1]))
+        # 32 bits: more are none of `np.random.RandomState`, which many environments still seed.
+        (number,) = np.random.SeedSequence([int(part) for part in seed]).generate_state(1)
+        observation, _ = env.reset(seed=int(number))
         return self._row(env, observation, 0.0, False, False)
 
     def _row(

@@ -10,7 +10,7 @@ from jax.extend import core
 
 CUSTOM_DERIVATIVES = ("custom_jvp_call", "custom_vjp_call")
 # Primitives that only call one trace: its equations can be run in place.
-CALLS = ("jit", "closed_call", "core_call", "checkpoint", *CUSTOM_DERIVATIVES)
+CALLS = ("jit", "closed_call", "core_call", "checkpoint", "remat", "remat2", *CUSTOM_DERIVATIVES)
 
 
 def sub_jaxprs(eqn: core.JaxprEqn) -> list[core.ClosedJaxpr]:

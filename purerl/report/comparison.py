@@ -115,6 +115,8 @@ def describe(result: dict[str, Any]) -> list[str]:
                 "Paired: differences between runs of one seed, which begin with the same weights "
                 "if the networks have one shape; the surer figure then."
             )
+    if result["metric"] != "eval/episode_return":
+        lines.append("More counts as better: 'worst' and '10th pct' are the low end.")
     if result["pairs"]:
         lines.append("Runs of one configuration and seed count once, as the first of them.")
     return lines + notes(groups)

@@ -19,7 +19,7 @@ class Group(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """A group's learning curve, at the steps that all its runs have."""
+    """A group's learning curve, at the steps that all its runs have, but for those that failed."""
 
     label: str
     steps: list[int]
@@ -168,18 +168,29 @@ def versus(group: Group, baseline: Group, metric: str) -> dict[str, Any] | None:
 
 
 def learning_curve(group: Group, metric: str) -> Curve | None:
-    """Returns a group's learning curve; None where its runs share no step."""
-    found = [
-        [run.curve(metric) for run in runs if _score(run, metric) is not None]
-        for runs in group.strata.values()
+    """Returns a group's learning curve; None where its runs share no step.
+
+    A failed run goes on with the last value that it reached, which is its score: it would else end
+    the curve of the others.
+    """
+    counted = [
+        [run for run in runs if _score(run, metric) is not None] for runs in group.strata.values()
     ]
-    strata = [curves for curves in found if curves]
-    runs = [curve for curves in strata for curve in curves]
-    steps = sorted(set.intersection(*map(set, runs))) if runs else []
+    strata = [[run.curve(metric) for run in runs] for runs in counted if runs]
+    curves = [curve for found in strata for curve in found]
+    sound = [run.curve(metric) for runs in counted for run in runs if run.status != "failed"]
+    steps = sorted(set.intersection(*map(set, sound or curves))) if curves else []
+    steps = [step for step in steps if all(min(curve) <= step for curve in curves)]
     if not steps:
         return None
-    values = [np.array([[curve[s] for s in steps] for curve in curves]) for curves in strata]
-    return Curve(group.label, steps, bootstrap.curve_band(values), runs)
+    values = [np.array([_carried_on(curve, steps) for curve in found]) for found in strata]
+    return Curve(group.label, steps, bootstrap.curve_band(values), curves)
+
+
+def _carried_on(curve: dict[int, float], steps: Sequence[int]) -> list[float]:
+    """Returns the last value of a curve up to each of `steps`."""
+    known = sorted(curve)
+    return [curve[known[i - 1]] for i in np.searchsorted(known, steps, side="right")]
 
 
 def every_curve(group: Group, metric: str) -> Curve:

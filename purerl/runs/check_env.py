@@ -159,6 +159,11 @@ def check_fields(state: Any) -> None:
     if not leaves:
         raise EnvError("observation is empty: it must hold at least one float32 array.")
     for path, leaf in leaves:
+        if len(path) > 1:
+            raise EnvError(
+                f"observation{jax.tree_util.keystr(path)} is inside another dict: an observation "
+                "is one array, or a dict of arrays. Name its parts 'arm/angle', say."
+            )
         if leaf.dtype != jnp.float32 or leaf.ndim == 0:
             raise EnvError(
                 f"observation{jax.tree_util.keystr(path)} is {_describe(leaf)}: its "

@@ -79,6 +79,8 @@ def wrong_value(record: Any, path: str = "") -> str:
     >>> wrong_value(Config(num_steps=10_000, num_epochs=2.5))
     'num_epochs is 2.5; it must be a whole number.'
     """
+    for name in _without_annotation(type(record)):
+        return f"{path}{name} has no annotation, so it is no setting: write `{name}: float`, say."
     for name, hint in hints(type(record)).items():
         value, where = getattr(record, name, None), f"{path}{name}"
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -87,6 +89,17 @@ def wrong_value(record: Any, path: str = "") -> str:
         elif (value is not None or _is_own(record)) and not fits(hint, value, exact=True):
             return f"{where} is {value!r}; it must be {_in_words(hint)}."
     return ""
+
+
+def _without_annotation(kind: type) -> list[str]:
+    """Returns what looks like a field of a dataclass, but is none; a constant is in capitals."""
+    annotated = inspect.get_annotations(kind)
+    return [
+        name
+        for name, value in vars(kind).items()
+        if isinstance(value, bool | int | float | str | tuple)
+        and not (name.startswith("_") or name.isupper() or name in annotated)
+    ]
 
 
 def _is_own(record: Any) -> bool:

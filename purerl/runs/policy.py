@@ -50,6 +50,16 @@ class Policy:
         self._memory: PyTree = None
         self._batch: tuple[int, ...] = ()
 
+    @property
+    def memory(self) -> PyTree:
+        """What a recurrent policy remembers after the last call, [..., H]; None before the first.
+
+        The leading axes are those of the observation.
+        """
+        return jax.tree.map(
+            lambda x: np.asarray(x).reshape(*self._batch, *x.shape[1:]), self._memory
+        )
+
     def __call__(self, observation: Any, key: Array | None = None) -> np.ndarray:
         """Chooses an action, and moves the memory on.
 

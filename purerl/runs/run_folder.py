@@ -183,6 +183,8 @@ def cure(found: list[str]) -> str:
         return "Give the command in the folder it was begun in"
     if all(line.startswith(("source.", "experiment.py: ")) for line in found):
         return "Put back what was edited"
+    if all(line.startswith("model: ") for line in found):  # no setting and no code has made it so
+        return "Put back what was edited of the MuJoCo model, the MJCF or a file that it reads"
     given = "Give the command it was begun with" + _options(found)
     if any(line.startswith("settings.ppo.num_steps") for line in found):
         return f"{given}; to train longer, copy the run first (docs/howto/go_on.md)"
@@ -190,17 +192,17 @@ def cure(found: list[str]) -> str:
 
 
 def _options(found: list[str]) -> str:
-    """Returns the options that bring settings back that differ, in brackets; "" if there is none.
+    """Returns the options that bring settings back that differ, as a clause; "" if there is none.
 
     >>> _options(["settings.ppo.num_steps: 300000 -> 500000", "versions.jax: 1 -> 2"])
-    ' (--ppo.num-steps 300000)'
+    ', which has --ppo.num-steps 300000'
     """
     lines = [line.removeprefix("settings.") for line in found if line.startswith("settings.")]
     parts = [line.partition(" -> ")[0].split(": ", 1) for line in lines]
     words = [
         f"--{name.replace('_', '-')} {value.strip('[]').replace(',', '')}" for name, value in parts
     ]
-    return f" ({' '.join(words)})" if words else ""
+    return f", which has {' '.join(words)}" if words else ""
 
 
 def _identity(folder: Path) -> dict[str, str]:

@@ -70,6 +70,20 @@ def test_steps_are_theirs_with_actions_in_their_limits():
     assert float(env.step(after[-1], jnp.ones(1)).observation[1]) == float(after[-1].observation[1])
 
 
+class Older(Counter):
+    """Draws as environments of before Gymnasium's `np_random` do."""
+
+    def reset(self, *, seed=None, options=None):
+        self.sum, self.steps = np.random.RandomState(seed).uniform(), 0
+        return self.seen(), {}
+
+
+def test_an_environment_may_draw_with_numpys_older_generator():
+    env = counter(Older)
+    starts = [env.reset(jax.random.key(k)).observation for k in range(20)]
+    assert len({np.asarray(start).tobytes() for start in starts}) == 20
+
+
 def test_being_cut_off_is_no_end_of_the_task():
     env = counter()
     states = walk(env, env.reset(jax.random.key(0)), [-1.0] * 5)

@@ -191,3 +191,17 @@ def test_a_gradient_through_mjx_is_that_of_finite_differences():
     difference = (compiled(ctrl + 0.05) - compiled(ctrl - 0.05)) / 0.1
     np.testing.assert_allclose(gradient[0], difference, rtol=2e-3)
     assert not exact.unordered_sums(ordered, ctrl)
+
+
+def test_sums_inside_what_is_computed_again_for_its_derivative_have_an_order():
+    twice = np.array([0, 0])
+
+    def added(x):
+        return jax.checkpoint(lambda y: y.at[twice].add(1.0))(x)
+
+    def slope(x):
+        return jax.grad(lambda x: jax.checkpoint(lambda y: y[twice].prod())(x))(x)
+
+    for function, want in ((added, [3.0, 1.0, 1.0]), (slope, [2.0, 0.0, 0.0])):
+        rewritten = exact.rewrite(function, platform="cuda")
+        np.testing.assert_array_equal(rewritten(jnp.ones(3)), want)

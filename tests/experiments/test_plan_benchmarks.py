@@ -5,6 +5,7 @@ import csv
 import pytest
 
 from experiments.benchmarks import plan_speed, plan_suite
+from purerl.core.errors import UserError
 from purerl.tune.plan.settings import Settings
 
 TASK = "cartpole-swingup"
@@ -30,6 +31,21 @@ def test_batches_that_the_file_has_are_not_played_again(tmp_path, monkeypatch, c
     monkeypatch.setattr("sys.argv", [*words[:-1], "2", "--out", str(file)])
     assert plan_suite.main() == 0
     assert played == [(TASK, "mppi", 20, 1, 2)]  # the second batch, of a seed of its own
+
+
+def test_a_file_of_another_command_is_one_line(tmp_path, monkeypatch):
+    file = tmp_path / "others.csv"
+    file.write_text("seed,steps,return\n1,2,3\n")
+    monkeypatch.setattr("sys.argv", ["plan_suite", "--table", "--out", str(file)])
+    with pytest.raises(UserError, match="has no column planner"):
+        plan_suite.main()
+
+
+@pytest.mark.parametrize("words", [["--batches", "0"], ["--out", "."]])
+def test_an_argument_that_nothing_can_come_of_is_refused_before_measuring(words, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["plan_suite", "--table", *words])
+    with pytest.raises(SystemExit):
+        plan_suite.main()
 
 
 @pytest.mark.parametrize("name", ["mppi", "mppi+policy"])

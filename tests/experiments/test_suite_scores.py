@@ -89,6 +89,12 @@ def test_of_a_seed_that_two_machines_have_the_longer_counts(tmp_path):
         assert suite_scores.merged(read) == [long, other]
 
 
+def test_a_seed_that_is_done_counts_beside_a_longer_one_that_is_not():
+    done, longer = seed(1, 5.0), seed(1, 5.0, 7.0, status="unfinished")
+    for order in ([done, longer], [longer, done]):
+        assert suite_scores.merged([[one] for one in order]) == [done]
+
+
 def test_runs_that_are_left_out_are_told(tmp_path, capsys):
     short, long = seed(1, 5.0, status="unfinished"), seed(1, 5.0, 7.0)
     for name, seeds in (("a.csv", [long, seed(2, 1.0)]), ("b.csv", [short])):

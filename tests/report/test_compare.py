@@ -147,6 +147,19 @@ def test_curves_are_written_as_numbers_and_as_a_picture(tmp_path):
     assert row["label"] == "walk" and float(row["iqm"]) == 12.0 and row["n"] == "5"
 
 
+def test_a_run_that_failed_early_does_not_end_the_others_curve(tmp_path):
+    make_seeds(tmp_path / "runs", "a", [4.0, 8.0, 12.0, 16.0])
+    make_run(tmp_path / "runs" / "b", 9, [3.0, None], more={"train/reward": None})  # after 200
+    found(tmp_path, tmp_path / "runs")
+    with (tmp_path / "out" / "curves.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["steps"]) for row in rows] == [100, 200, 300, 400]
+    assert [float(row["iqm"]) for row in rows] == [
+        pytest.approx(sum(sorted([x, 2 * x, 3 * x, 4 * x, 3.0])[1:-1]) / 3)
+        for x in (1.0, 2.0, 3.0, 4.0)
+    ]
+
+
 def test_below_five_seeds_there_is_no_interval_and_it_says_so(tmp_path, capsys):
     make_seeds(tmp_path / "runs", "a", [1.0, 2.0, 3.0, 4.0])
     make_seeds(tmp_path / "runs", "b", [1.0, 2.0, 3.0, 4.0, 5.0], rate=1.0)

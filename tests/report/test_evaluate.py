@@ -12,7 +12,7 @@ import pytest
 
 from purerl import evaluate, run
 from purerl.core.errors import USAGE
-from purerl.runs import checkpoint_folder
+from purerl.runs import checkpoint_folder, loaded_run
 
 TOY = Path(__file__).parent.parent / "runs" / "toy_experiment.py"
 ROOT = TOY.parent.parent.parent
@@ -144,3 +144,17 @@ def test_it_leaves_in_silence_when_its_reader_has(trained):
     ended.stdout.close()  # as `| head` does
     assert ended.stderr.read() == b""
     assert ended.wait() == 128 + signal.SIGPIPE
+
+
+def test_a_file_that_cannot_be_written_is_said_before_the_episodes(
+    trained, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(loaded_run, "load", lambda *_: pytest.fail("the run was loaded"))
+    assert evaluate.main([str(trained), "--json", str(tmp_path)]) == USAGE
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_the_figures_are_shown_where_the_disk_is_full(trained, capsys):
+    assert evaluate.main([str(trained), "--episodes", "2", "--json", "/dev/full"]) == USAGE
+    shown = capsys.readouterr()
+    assert "N = 2 episodes" in shown.out and "No space left" in shown.err

@@ -2,6 +2,7 @@
 
 import functools
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +17,7 @@ from experiments import custom_network
 from purerl import __main__ as commands
 from purerl.core.errors import USAGE
 from purerl.report import episode_arrays, numpy_policy, policy_npz
-from purerl.report.policy_file import Recorded, control_range, record_episodes
+from purerl.report.policy_file import Recorded, control_range, origin, record_episodes
 from tests.golden import privileged, recurrent
 from tests.test_readme import PAGES, blocks
 
@@ -130,6 +131,12 @@ def test_the_command_writes_it(place, tmp_path, capsys, monkeypatch):
     said = capsys.readouterr().out
     assert "actions: " in said and ", over 160 observations of 8 episodes" in said
     assert re.search(r"\npolicy.npz \([\d,]+ bytes\)\n$", said)
+
+
+def test_a_run_that_was_moved_keeps_the_name_of_its_experiment(place, tmp_path):
+    run, _ = trained("relu", place)
+    moved = Path(shutil.copytree(run.folder, tmp_path / "moved"))
+    assert origin(purerl.load(moved))["experiment"] == origin(run)["experiment"] != tmp_path.name
 
 
 def test_mistakes_are_one_line(place, tmp_path, capsys):

@@ -100,6 +100,12 @@ class IntegerObservation(Toy):
         return super().reset(key).replace(observation={"policy": jnp.zeros(2, jnp.int32)})
 
 
+class NestedObservation(Toy):
+    def reset(self, key):
+        state = super().reset(key)
+        return state.replace(observation={"policy": {"arm": state.observation["policy"]}})
+
+
 class NoObservation(Toy):
     def reset(self, key):
         return super().reset(key).replace(observation=())
@@ -241,6 +247,7 @@ BROKEN = {
     IntegerMetric: r"metrics\['distance'\]",
     ListMetrics: "metrics",
     IntegerObservation: r"observation\['policy'\]",
+    NestedObservation: r"observation\['policy'\]\['arm'\] is inside another dict",
     NoObservation: "observation",
     WeakReward: "reward is weakly typed in one of the two",
     OtherMetric: r"metrics\['distance'\] is in the state of reset only",

@@ -87,3 +87,16 @@ def test_what_fits_passes(options):
 )
 def test_a_persons_own_settings_are_checked_too(options, named):
     assert wrong_value(options) == named
+
+
+def test_a_setting_without_an_annotation_is_named():
+    """Python makes no field of it, and the command line would have no option."""
+
+    @dataclass(frozen=True)
+    class Options:
+        reach: float = 1.0
+        width = 0.05
+        LIMIT = 3
+
+    told = wrong_value(dataclasses.replace(EXPERIMENT, env=Options()))
+    assert told == "env.width has no annotation, so it is no setting: write `width: float`, say."

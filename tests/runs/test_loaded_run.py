@@ -15,6 +15,7 @@ import pytest
 import purerl
 from purerl import evaluate
 from purerl.core.keys import Purpose, derive, per_environment
+from purerl.report.episode_arrays import record
 from purerl.runs import experiment, loaded_run, policy, training
 from tests.golden import privileged, recurrent
 
@@ -48,6 +49,23 @@ def test_its_actions_are_those_of_an_evaluation(run):
         returns += np.asarray(state.reward)
     np.testing.assert_allclose(returns, judged["episode_return"]["values"], rtol=1e-5)
     assert np.std(returns) > 1e-3
+
+
+def test_a_policys_memory_is_what_an_episode_records(run):
+    """After t calls it is the memory before step t."""
+    recorded = record(run.restored.setup, run.state, 0, 2)
+    names = [name for name in recorded if name.startswith("memory")]
+    seen = {k.removeprefix("observation/"): x for k, x in recorded.items() if "observation" in k}
+    run.policy.reset()
+    assert run.policy.memory is None
+    for t in range(3):
+        now = {k: x[:, t] for k, x in seen.items()}
+        run.policy(now.get("observation", now))
+        leaves = jax.tree.leaves(run.policy.memory)
+        assert len(leaves) == len(names)
+        for name, leaf in zip(names, leaves, strict=True):
+            assert leaf.shape == recorded[name][:, t + 1].shape
+            np.testing.assert_allclose(leaf, recorded[name][:, t + 1], atol=1e-5)
 
 
 def test_one_observation_or_several_give_the_same(run):

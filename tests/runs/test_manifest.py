@@ -172,11 +172,16 @@ def test_a_run_on_c_imports_no_other_engine():
         (["settings.ppo.gamma: 0.99 -> 0.9", run_folder.EDITED], "Put the file back"),
         (["vmapped_seeds: {'first': 1, 'number': 3} -> (absent)"], "--num-seeds and --seed"),
         (["schedule.log_every: 1 -> 2", "settings.ppo.num_steps: 9 -> 99"], "go_on.md"),
-        (["settings.ppo.num_steps: 9 -> 99"], "the command it was begun with (--ppo.num-steps 9);"),
+        (
+            ["settings.ppo.num_steps: 9 -> 99"],
+            "the command it was begun with, which has --ppo.num-steps 9;",
+        ),
         (
             ["settings.network.policy_hidden: [8, 16] -> [8]", "settings.seed: 2 -> 1"],
-            "begun with (--network.policy-hidden 8 16 --seed 2)",
+            "begun with, which has --network.policy-hidden 8 16 --seed 2",
         ),
+        (["model: ab -> cd"], "Put back what was edited of the MuJoCo model"),
+        (["model: ab -> cd", "settings.env.mass: 1.0 -> 2.0"], "which has --env.mass 1.0"),
         (
             ["source.pk.mine: ab -> (absent)", "source.purerl_experiment_mine: (absent) -> ab"],
             "in the folder it was begun in",

@@ -87,6 +87,7 @@ def test_an_edited_body_is_told_and_not_resumed(place, capsys):
     assert train(place, "--resume") == errors.USAGE
     said = capsys.readouterr().err
     assert "model: " in said and "source" not in said
+    assert "Put back what was edited of the MuJoCo model" in said
 
 
 def test_edited_code_beside_the_file_is_named(place, capsys, monkeypatch):
