@@ -127,8 +127,8 @@ def find_source(name: str) -> Source:
         spec = importlib.util.find_spec(name) if "." in name else None
     if spec is not None and str(spec.origin).endswith(".py"):
         return load(Path(str(spec.origin)))
-    if Path(name).exists():
-        raise UserError(f"{name} is no Python file; an experiment is one, such as mine.py.")
+    if Path(name).exists() or Path(f"{name}.py").is_file():
+        raise UserError(f"{name} is no Python file; an experiment is one, as {Path(name).stem}.py.")
     places = f" in {' or '.join(map(str, _folders())) or 'sight'}"
     raise UserError(unknown_name("experiment", name, named, places))
 

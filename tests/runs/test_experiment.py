@@ -143,3 +143,10 @@ def test_a_setting_that_json_cannot_hold_is_named():
     env = dataclasses.replace(chosen.env, name=len)
     with pytest.raises(UserError, match=r"env.name is a builtin_function"):
         experiment.to_json(dataclasses.replace(chosen, env=env))
+
+
+def test_a_name_whose_file_is_here_is_told_the_file(tmp_path, monkeypatch):
+    (tmp_path / "track.py").write_text("")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match="as track.py"):
+        experiment.find_source("track")
