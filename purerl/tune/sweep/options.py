@@ -14,6 +14,7 @@ from purerl.core.errors import UserError, nearest, one_line, unknown_name
 from purerl.runs import command_line
 from purerl.runs.experiment import find_source
 from purerl.runs.files import check_name, read_bytes
+from purerl.runs.options import Options as RunOptions
 from purerl.tune.sweep import points
 from purerl.tune.sweep.points import Base
 
@@ -24,6 +25,7 @@ NOT_HERE = {
     "--runs": "the runs are in the sweep's folder: give --sweeps or --name",
     "--resume": "the same command goes on by itself: leave it out",
     "--distributed": "a sweep starts each run as one process",
+    "--name": "it names the sweep: in a file it stands above [settings]",
 }
 
 
@@ -87,16 +89,19 @@ def read(arguments: Sequence[str]) -> tuple[Options, Base, list[str]]:
         check_name("name", options.name)
     source = find_source(named)
     folder = options.sweeps / (options.name or source.name)
-    base = Base(named, source.name, source.experiment, (), options.seeds, folder)
+    base = Base(named, source, source.experiment, (), options.seeds, folder, RunOptions())
     for name, value in settings.items():
         rest += points.option_words(base, name, _text(name, value))
-    chosen, given = _read_settings(source, named, rest), [word.partition("=")[0] for word in rest]
+    chosen, of_run = _read_settings(source, named, rest)
+    given = [word.partition("=")[0] for word in rest]
     given = [word.replace("_", "-") for word in given if word.startswith("--")]
     for word, instead in NOT_HERE.items():
         if word in given:
-            raise UserError(f"{word} is no option of a sweep; {instead}.")
+            raise UserError(f"{word} is no option of a sweep's runs; {instead}.")
     check(options)
-    return options, base._replace(chosen=chosen, words=tuple(rest)), given
+    of_run = dataclasses.replace(of_run, num_seeds=options.seeds)
+    check_shards(of_run)
+    return options, base._replace(chosen=chosen, words=tuple(rest), options=of_run), given
 
 
 def check(options: Options) -> None:
@@ -116,6 +121,15 @@ def check(options: Options) -> None:
         raise UserError(
             "--optuna chooses a point when others have ended, and --slurm submits all at once; "
             "leave one of them out."
+        )
+
+
+def check_shards(of_run: RunOptions) -> None:
+    """Raises UserError where every run would: `runs/session.py` has the same rule, behind JAX."""
+    if of_run.vmapped_seeds > 1 and of_run.num_shards > 1:
+        raise UserError(
+            f"num_shards is {of_run.num_shards}, and {of_run.num_seeds} vmapped seeds share one "
+            "program on one device; use --seeds-by map, or leave out --num-shards."
         )
 
 
@@ -144,9 +158,12 @@ def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def _read_settings(source: Any, named: str, rest: list[str]) -> Any:
-    """Returns the experiment with what all points share; a wrong option may be near one of ours."""
+    """Returns the experiment with what all points share, and the options of each run.
+
+    A wrong option may be near one of ours.
+    """
     try:
-        return command_line.from_command_line(source, rest, f"python -m purerl.run {named}")[0]
+        return command_line.from_command_line(source, rest, f"python -m purerl.run {named}")
     except UserError as error:
         wrong = re.match(r"There is no option (\S+)\. All", str(error))
         near = nearest(wrong[1], sorted(OWN)) if wrong else ""
@@ -176,9 +193,7 @@ def _read_file(path: Path) -> tuple[list[str], dict[str, Any]]:
     settings = _table(path, "settings", found.pop("settings", {}))
     for name in (word.removeprefix("--") for word in SEVERAL):
         for setting, values in _table(path, name, found.pop(name, {})).items():
-            each = values if isinstance(values, list) else [values]
-            text = ",".join(_text(setting, value) for value in each)
-            words += [f"--{name}", f"{setting}={text}"]
+            words += [f"--{name}", f"{setting}={_texts(path, setting, values)}"]
     for name, value in found.items():
         words += [f"--{name.replace('_', '-')}", _text(name, value)]
     return words, settings
@@ -193,6 +208,19 @@ def _table(path: Path, name: str, value: Any) -> dict[str, Any]:
         inner = _table(path, key, one) if isinstance(one, Mapping) else {"": one}
         found |= {f"{key}.{rest}".rstrip("."): x for rest, x in inner.items()}
     return {key.replace("_", "-"): one for key, one in found.items()}
+
+
+def _texts(path: Path, setting: str, values: Any) -> str:
+    """Returns a swept setting's values as on a command line, where commas part them."""
+    if not isinstance(values, list):
+        return _text(setting, values)
+    texts = [_text(setting, value) for value in values]
+    if cut := [text for text in texts if "," in text]:
+        raise UserError(
+            f"{path}: {setting} has the value {cut[0]!r}, and a comma parts values; write each "
+            "part as a text of its own, or choose a value without a comma."
+        )
+    return ",".join(texts)
 
 
 def _text(name: str, value: Any) -> str:

@@ -11,7 +11,7 @@ import tyro
 from purerl.core.errors import UserError, one_line
 from purerl.runs import experiment, others_words
 from purerl.runs.command_line import WORDS, parse
-from purerl.runs.experiment import Experiment
+from purerl.runs.experiment import Experiment, Source
 from purerl.runs.kinds import hints
 from purerl.runs.options import Options
 from purerl.tune.sweep.scheduler import Job
@@ -34,11 +34,17 @@ class Base(NamedTuple):
     """What all points have in common."""
 
     experiment: str  # as the user named it
-    name: str  # of the experiment
+    source: Source  # of the experiment
     chosen: Experiment  # with the settings that all points share
     words: tuple[str, ...]  # of the run command, those of the points excepted
     seeds: int
     folder: Path  # of the sweep
+    options: Options  # of each run, as the words give them
+
+    @property
+    def name(self) -> str:
+        """The experiment's name."""
+        return self.source.name
 
 
 def read_spaces(base: Base, texts: Iterable[str], given: Sequence[str]) -> list[Space]:
@@ -127,6 +133,18 @@ def check_all(base: Base, points: Sequence[Point]) -> None:
     read = {pair: read_value(base, *pair) for pair in sorted(pairs)}
     for point in points:
         check_typed(base, point.values, {n: read[n, text] for n, text in point.values.items()})
+
+
+def check_evaluated(base: Base, spaces: Sequence[Space], metric: str) -> None:
+    """Raises UserError where the score is one of evaluations, and a point may have none."""
+    name = "evaluation.number"
+    swept = [end for space in spaces if space.setting == name for end in space.ends]
+    numbers = [read_value(base, name, end) for end in swept] or [base.chosen.evaluation.number]
+    if metric.startswith("eval/") and 0 in numbers:
+        raise UserError(
+            f"{name} is 0, and a point without an evaluation has no {metric}; give at least 1, or "
+            "another --metric, such as train/episode_return."
+        )
 
 
 def check_typed(base: Base, values: Values, typed: Mapping[str, Any]) -> Experiment:

@@ -1,16 +1,20 @@
 """Carries a sweep out: its folder, its runs, its table."""
 
 import contextlib
+import hashlib
 import itertools
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, UserError
 from purerl.runs import manifest
-from purerl.runs.experiment import to_json
-from purerl.runs.files import make_folder, read_json, write_json
+from purerl.runs.experiment import Source, to_json
+from purerl.runs.files import check_object, make_folder, read_json, write_json
 from purerl.runs.lock import RunLock
 from purerl.runs.output import say, show, warn
+from purerl.runs.run_folder import is_begun
+from purerl.runs.source_hashes import PACKAGE, source_hashes
 from purerl.tune.sweep import picture, points, scheduler, slurm, spaces, study, table
 from purerl.tune.sweep.options import Options, read
 from purerl.tune.sweep.points import Base, Point
@@ -31,6 +35,7 @@ def execute(arguments: Sequence[str]) -> int:
     """Checks the whole command, then carries it out; returns the exit code."""
     options, base, given = read(arguments)
     swept = points.read_spaces(base, options.grid or options.over, given)
+    points.check_evaluated(base, swept, options.metric)
     sweep = Sweep(options, base, swept, [])
     if options.optuna:
         spaces.check_number("optuna", options.optuna)
@@ -71,32 +76,73 @@ def _begin(sweep: Sweep) -> Iterator[None]:
         make_folder(folder)
         if not file.exists() and any(not one.name.startswith(".") for one in folder.iterdir()):
             raise UserError(f"{folder} holds no sweep, but other files; use another --name.")
-        lock = RunLock(folder)
+        lock = _lock(folder)
     except OSError as error:
         raise UserError(f"{folder} cannot be written: {error.strerror}.") from error
-    except UserError as error:
-        if "process" not in str(error):
-            raise
-        raise UserError(
-            f"The sweep {folder} is being carried out by another process; stop that one first, or "
-            "use another --name."
-        ) from error
     try:
         described = _describe(sweep)
-        found = manifest.differences(read_json(file), described) if file.exists() else []
-        if found:
-            more = f" (and {len(found) - 1} more)" if found[1:] else ""
-            raise UserError(
-                f"The sweep {folder} was begun otherwise: {found[0]}{more}; give the command it "
-                "was begun with, or another --name."
-            )
+        if file.exists():
+            # An older version wrote less down, and goes on.
+            begun = check_object(str(file), described | read_json(file), source=dict)
+            _check_same(folder, begun, described)
+            _check_code(sweep.base, begun["source"], described["source"])
         write_json(file, described)
         yield
     finally:
         lock.close()
 
 
-def _describe(sweep: Sweep) -> dict[str, object]:
+def _lock(folder: Path) -> RunLock:
+    try:
+        return RunLock(folder)
+    except UserError as error:
+        raise UserError(
+            f"The sweep {folder} is being carried out by another process; stop that one first, or "
+            "use another --name."
+        ) from error
+
+
+def _check_same(folder: Path, begun: dict[str, Any], now: dict[str, Any]) -> None:
+    """Raises UserError unless both describe one sweep; its code is looked at by itself."""
+    found = manifest.differences(begun | {"source": now["source"]}, now)
+    if found:
+        more = f" (and {len(found) - 1} more)" if found[1:] else ""
+        raise UserError(
+            f"The sweep {folder} was begun otherwise: {found[0]}{more}; give the command it was "
+            "begun with, or another --name."
+        )
+
+
+def _check_code(base: Base, begun: dict[str, Any], now: dict[str, str]) -> None:
+    """Raises UserError if a run has begun with other code of the experiment than it has now.
+
+    A file that is new, or no longer imported, is so by a change of one that is in both.
+    """
+    changed = [name for name in begun if now.get(name, begun[name]) != begun[name]]
+    if not changed or base.options.allow_changes:
+        return
+    if any(map(is_begun, (base.folder / base.name).glob("*"))):
+        more = f" and {len(changed) - 1} more" if changed[1:] else ""
+        raise UserError(
+            f"The experiment's code has changed since the sweep {base.folder} began: {changed[0]}"
+            f"{more}; put it back, use another --name, or go on all the same with --allow-changes."
+        )
+
+
+def _code(source: Source) -> dict[str, str]:
+    """Returns hashes of the experiment's code: its file, and by module what it imports.
+
+    The library's own is a condition, as versions are: `compare` names them.
+    """
+    own = hashlib.sha256(source.text).hexdigest()[:16]
+    found = source_hashes((source.experiment.build_env, source.experiment.build_network))
+    own_too = {name for name, digest in found.items() if digest == own}
+    library = {name for name in found if name.partition(".")[0] == PACKAGE.name}
+    others = {name: found[name] for name in found.keys() - own_too - library}
+    return {source.path.name: own} | dict(sorted(others.items()))
+
+
+def _describe(sweep: Sweep) -> dict[str, Any]:
     """Returns what makes a sweep another one; of drawn points their number does not."""
     options, base = sweep.options, sweep.base
     values = {
@@ -108,6 +154,10 @@ def _describe(sweep: Sweep) -> dict[str, object]:
     how = "random" if options.random else "optuna" if options.optuna else "grid"
     found = {"experiment": base.name, "settings": to_json(base.chosen), "swept": values}
     found |= {"points": how, "seeds": options.seeds}
+    # Options of the runs that alter their bits, or the steps that a line of metrics is about.
+    found |= {n: getattr(base.options, n) for n in ("portable", "num_shards", "log_every")}
+    found |= {"seeds_by": base.options.seeds_by} if options.seeds > 1 else {}
+    found |= {"source": _code(base.source)}
     return found | ({"metric": options.metric} if options.optuna else {})
 
 
@@ -126,6 +176,7 @@ class _Progress:
             known = study.known(self.study, sweep.spaces)
             self.points = {point.name: point for point in known}
         self.results: list[Ended] = []
+        self.begun: set[str] = set()  # by this command
 
     def jobs(self) -> Iterator[Job]:
         """Yields what is to be run; Optuna chooses when it is asked for."""
@@ -137,17 +188,23 @@ class _Progress:
             yield points.job(self.sweep.base, point)
 
     def began(self, job: Job) -> None:
+        self.begun.add(job.name)
         say(f"{job.name}  begins   {self._values(job)}  (progress: {job.log})")
 
     def ended(self, result: Ended) -> None:
-        """Tells how a job ended; UserError if it is done and has no such metric."""
+        """Tells how a job ended; UserError if it is done, and no run so far has such a metric.
+
+        That is told once of a point, so that the same command goes on; at the end in any case.
+        """
         self.results.append(result)
         point, metric, score = self.points[result.job.name], self.sweep.options.metric, None
         if result.status == "done":
-            table.check_metric(self.sweep.base, point, metric)
             group = table.group_of(self.sweep.base, point)
             score = table.summarize(group, metric)["iqm"]
-        if self.study is not None and result.status != "stopped":
+            told_now = point.name in self.begun or len(self.results) == self.number
+            if score is None and told_now:
+                table.check_metric(self.sweep.base, self.points.values(), metric)
+        if self.study is not None and score is not None:
             study.tell(self.study, point, score)
         shown = f": {result.said}" if score is None and result.said else ""
         shown = f": {score:.6g}" if score is not None else shown

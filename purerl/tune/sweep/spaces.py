@@ -1,7 +1,8 @@
 """What a swept setting may be: values to choose from, or a range to draw from.
 
 1e-4,3e-4       values, of which a grid takes each
-1..8            every whole number of a range; of a setting that is no whole number, any number
+1..8            every whole number of a range; of a setting that is no whole number, any number;
+                without a number beside the dots, as in ../body.xml, they are part of a value
 log:1e-5:1e-2   the same, the logarithm drawn evenly
 """
 
@@ -52,7 +53,7 @@ def parse_space(setting: str, text: str, whole: bool) -> Space:
     """
     log = text.startswith("log:")
     low, separator, high = text.removeprefix("log:").partition(":" if log else "..")
-    if not separator and not log:
+    if not log and not (separator and (_is_number(low) or _is_number(high))):
         choices = tuple(" ".join(part.split()) for part in text.split(",") if part.strip())
         if not choices:
             raise UserError(f"{setting} has no value; give it as {setting}=1,2,3.")
@@ -71,6 +72,14 @@ def parse_space(setting: str, text: str, whole: bool) -> Space:
         rule = "the lower end must come first" + " and be above 0" * log
         raise UserError(f"{setting} is {text}; {rule}.")
     return Space(setting, (), *ends, whole, log)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def grid(spaces: Sequence[Space]) -> list[Values]:

@@ -44,7 +44,10 @@ def known(study: Any, spaces: Sequence[Space]) -> list[Point]:
 
 def propose(study: Any, spaces: Sequence[Space], number: int) -> Iterator[Point]:
     """Yields the points without a score, then new ones until there are `number`."""
-    open_ones = {t.number for t in study.get_trials(deepcopy=False) if not t.state.is_finished()}
+    from optuna.trial import TrialState
+
+    trials = study.get_trials(deepcopy=False)
+    open_ones = {trial.number for trial in trials if trial.state != TrialState.COMPLETE}
     yield from (point for point in known(study, spaces) if point.number in open_ones)
     while len(known(study, spaces)) < number:
         study.sampler = _sampler(len(study.get_trials(deepcopy=False)))
@@ -52,15 +55,13 @@ def propose(study: Any, spaces: Sequence[Space], number: int) -> Iterator[Point]
         yield Point(trial.number, {s.setting: _text(s, trial.params) for s in spaces})
 
 
-def tell(study: Any, point: Point, score: float | None) -> None:
-    """Notes a point's score; None: it failed."""
-    from optuna.trial import TrialState
+def tell(study: Any, point: Point, score: float) -> None:
+    """Notes a point's score.
 
-    if study.get_trials(deepcopy=False)[point.number].state.is_finished():
-        return
-    if score is None:
-        study.tell(point.number, state=TrialState.FAIL)
-    else:
+    Of a point that failed nothing is told: Optuna takes no score of one that it knows as failed,
+    and the next command tries it once more.
+    """
+    if not study.get_trials(deepcopy=False)[point.number].state.is_finished():
         study.tell(point.number, score)
 
 

@@ -1,7 +1,7 @@
 """What came of a sweep: a row for each point, best first, as text and as CSV."""
 
 import numbers
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -56,10 +56,11 @@ def group_of(base: Base, point: Point) -> Group:
     return Group(point.name, runs, {"": runs})
 
 
-def check_metric(base: Base, point: Point, metric: str) -> None:
-    """Raises UserError, with the nearest name, if a point that is done has no such metric."""
-    group = group_of(base, point)
-    check_scored(group.runs, [group], metric)
+def check_metric(base: Base, points: Iterable[Point], metric: str) -> None:
+    """Raises UserError, with the nearest name, if no run of these points has such a metric."""
+    runs = [run for point in points for run in group_of(base, point).runs]
+    if not any(metric in line for run in runs for line in run.lines):
+        check_scored(runs, [], metric)
 
 
 def _rank(row: Row) -> tuple[Any, ...]:

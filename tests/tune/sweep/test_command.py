@@ -4,7 +4,7 @@ import shlex
 
 import pytest
 
-from purerl import sweep
+from purerl import run, sweep
 from purerl.core.errors import SUCCESS, USAGE
 from purerl.runs.command_line import from_command_line
 from purerl.runs.experiment import find_source
@@ -75,12 +75,22 @@ MISTAKES = [
     (["--gird", "ppo.gamma=0.9"], "no option --gird. Did you mean --grid?"),
     (["--grid", "ppo.gamma=0.9", "--ppo.gama", "1"], "--ppo.gama. Did you mean --ppo.gamma?"),
     (["--grid", "ppo.num-envs=1..10001"], "10,001 points, of at most 10,000"),
-    (["--grid", "ppo.gamma=0.9", "--num-seeds", "2"], "--num-seeds is no option of a sweep; give"),
+    (["--grid", "ppo.gamma=0.9", "--num-seeds", "2"], "is no option of a sweep's runs; give"),
     (["--grid", "ppo.gamma=0.9", "--seeds", "0"], "seeds is 0; it must be at least 1"),
     (["--grid", "ppo.gamma=0.9", "--random", "3"], "--grid and --random are two sweeps"),
     (["--over", "ppo.gamma=0.9"], "say how many points: --random 20"),
     (["--random", "3"], "--random draws nothing"),
     (["--optuna", "3", "--over", "ppo.gamma=0.9..1", "--slurm", "a=1"], "leave one of them out"),
+    (
+        ["--grid", "evaluation.number=0,3"],
+        "evaluation.number is 0, and a point without an evaluation has no eval/episode_return",
+    ),
+    (["--grid", "ppo.gamma=0.9", "--evaluation.number", "0"], "has no eval/episode_return; give"),
+    (["--optuna", "3", "--over", "evaluation.number=0..3"], "has no eval/episode_return; give"),
+    (
+        ["--grid", "ppo.gamma=0.9", "--num-shards", "2"],
+        "num_shards is 2, and 3 vmapped seeds share one program on one device; use --seeds-by map",
+    ),
     (["--grid", "ppo.gamma=0.9", "--name", "a/b"], "name is 'a/b'; it must be the name of one"),
 ]
 
@@ -102,6 +112,11 @@ def test_a_mistake_is_one_line_and_starts_nothing(words, said, capsys, place):
         ('experiment = "x"\nsedes = 3', "There is no key 'sedes'. Did you mean 'seeds'?"),
         ('experiment = "x"\ngrid = 3', "grid is 3; it must be a table, [grid]"),
         ('experiment = "x"\n[grid]\na = [2020-01-01]', "it must be a number, a text or a list"),
+        ('experiment = "x"\n[grid]\na = ["b,c", "d"]', "a has the value 'b,c', and a comma parts"),
+        (
+            f'experiment = "{TOY}"\n[grid]\nppo.gamma = [0.9]\n[settings]\nname = "hello"',
+            "--name is no option of a sweep's runs; it names the sweep: in a file it stands above",
+        ),
     ],
 )
 def test_a_file_with_a_mistake_is_one_line(text, said, capsys, place):
@@ -122,6 +137,23 @@ def test_without_the_package_there_is_a_line_to_paste(package, capsys, monkeypat
     assert said == f"purerl: The package {package} is not installed; run: pip install " + (
         "'purerl[sweep]'\n"
     )
+
+
+@pytest.mark.slow
+def test_shards_and_vmapped_seeds_are_refused_as_by_a_run(capsys):
+    words = [str(TOY), "--num-shards", "2"]
+    assert run.main([*words, "--num-seeds", "3", "--no-cache"]) == USAGE
+    said = capsys.readouterr().err
+    assert "num_shards is 2" in said
+    assert sweep.main([*words, "--grid", "ppo.gamma=0.9", "--seeds", "3"]) == USAGE
+    assert capsys.readouterr().err == said
+    for more in (["--seeds-by", "map"], ["--seeds", "1"]):
+        assert len(dry(capsys, *words, "--grid", "ppo.gamma=0.9", *more)) == 1
+
+
+def test_without_evaluations_another_metric_may_rank(capsys):
+    words = ["--grid", "evaluation.number=0,3", "--metric", "train/episode_return"]
+    assert len(dry(capsys, str(TOY), *words)) == 2
 
 
 def test_help_names_every_option(capsys):

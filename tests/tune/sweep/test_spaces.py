@@ -20,6 +20,11 @@ def test_a_grid_takes_every_combination_in_order():
     assert found[-1] == {"a": "3e-4", "b": "16", "c": "2"}
 
 
+def test_dots_without_a_number_beside_them_are_part_of_a_value():
+    for text in ("../a.xml,../b.xml", "../a.xml", "a..b,1"):
+        assert parse_space("x", text, False).choices == tuple(text.split(","))
+
+
 @pytest.mark.parametrize(
     ("text", "whole", "said"),
     [
@@ -30,6 +35,7 @@ def test_a_grid_takes_every_combination_in_order():
         ("log:1", False, "a range is two numbers"),
         ("log:1:nan", False, "a range is two numbers"),
         ("1..many", False, "a range is two numbers"),
+        ("few..8", False, "a range is two numbers"),
         ("1..2.5", True, "a whole number, and so must both ends be"),
     ],
 )

@@ -2,6 +2,7 @@
 
 import csv
 import importlib.util
+import json
 import os
 import signal
 import subprocess
@@ -80,6 +81,76 @@ def test_other_values_under_the_same_name_are_refused(place, capsys):
 
 
 @pytest.mark.slow
+def test_other_options_that_alter_results_are_refused(place, capsys):
+    assert start(*RATES) == SUCCESS
+    for words, named in [
+        (["--portable"], "portable: False -> True"),
+        (["--seeds-by", "map"], "seeds_by: vmap -> map"),
+        (["--num-shards", "1"], "num_shards: 0 -> 1"),
+        (["--log-every", "7"], "log_every: 0 -> 7"),
+    ]:
+        capsys.readouterr()
+        assert start(*RATES, *words) == USAGE
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert f"was begun otherwise: {named}; give" in line
+
+
+@pytest.fixture
+def own(place, monkeypatch):
+    """Somebody's experiment, which takes its environment from a module beside it."""
+    monkeypatch.syspath_prepend(place)
+    text = TOY.read_text()
+    assert "return Probe(" in text
+    (place / "mine_reward.py").write_text(text)
+    (place / TOY.name).write_text(f"from mine_reward import build_env\n{text}".replace(
+        "def build_env", "def _unused"))  # fmt: skip
+    yield place / TOY.name
+    sys.modules.pop("mine_reward", None)
+
+
+def edit(path: Path) -> None:
+    path.write_text(path.read_text() + "\nREWARD = 2\n")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [TOY.name, "mine_reward.py"])
+def test_other_code_of_the_experiment_is_refused(own, capsys, name):
+    words = [str(own), "--over", "ppo.gamma=0.8..0.9", "--seeds", "1", "--jobs", "1"]
+    Path("FAIL").touch()
+    assert sweep.main([*words, "--random", "1"]) == FAILURE
+    Path("FAIL").unlink()
+    edit(own.with_name(name))  # no run has a checkpoint: the mistake is mended
+    assert sweep.main([*words, "--random", "1"]) == SUCCESS
+    before = sorted(Path("sweeps").rglob("*"))
+    edit(own.with_name(name))
+    capsys.readouterr()
+    assert sweep.main([*words, "--random", "2"]) == USAGE
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line == (
+        "purerl: The experiment's code has changed since the sweep sweeps/toy_experiment began: "
+        f"{name.removesuffix('.py') if name != TOY.name else name}; put it back, use another "
+        "--name, or go on all the same with --allow-changes."
+    )
+    assert sorted(Path("sweeps").rglob("*")) == before
+    assert sweep.main([*words, "--random", "2", "--allow-changes"]) == SUCCESS
+    assert len(rows()) == 2
+
+
+@pytest.mark.slow
+def test_a_sweep_of_an_older_version_goes_on(own):
+    words = [str(own), *RATES, "--seeds", "1", "--jobs", "1"]
+    assert sweep.main(words) == SUCCESS
+    file = Path("sweeps/toy_experiment/sweep.json")
+    known = json.loads(file.read_text())
+    assert next(iter(known["source"])) == TOY.name and "mine_reward" in known["source"]
+    assert not [name for name in known["source"] if name.partition(".")[0] == "purerl"]
+    old = ("experiment", "settings", "swept", "points", "seeds")
+    file.write_text(json.dumps({name: known[name] for name in old}))
+    edit(own)
+    assert sweep.main([*words, "--log-every", "7"]) == SUCCESS
+
+
+@pytest.mark.slow
 def test_more_can_be_drawn_later(place):
     words = ["--over", "ppo.learning-rate=log:1e-4:1e-1", "--seeds", "1"]
     assert start("--random", "2", *words) == SUCCESS
@@ -95,6 +166,39 @@ def test_a_metric_that_no_run_has_is_told_after_the_first_one(place, capsys):
     said = capsys.readouterr().err
     assert "no metric 'eval/episode_retrun'" in said and "'eval/episode_return'" in said
     assert len(list(Path("sweeps/toy_experiment/logs").iterdir())) == 1
+    assert start(*RATES) == SUCCESS
+    capsys.readouterr()
+    assert start(*RATES, "--metric", "eval/episode_retrun") == USAGE  # all are done
+    assert "no metric 'eval/episode_retrun'" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_point_without_the_metric_has_no_score_and_stops_no_other(place):
+    words = ["--grid", "ppo.gamma=0.9,0.4,0.8", "--seeds", "1", "--jobs", "1"]
+    for _ in range(2):
+        assert start(*words) == SUCCESS
+        found = {row["ppo.gamma"]: row for row in rows()}
+        assert len(found) == 3 and {row["status"] for row in rows()} == {"done"}
+        assert list(found)[-1] == "0.4" and found["0.4"]["iqm"] == ""
+
+
+@pytest.mark.slow
+def test_a_first_point_without_the_metric_is_told_once(place, capsys):
+    words = ["--grid", "ppo.gamma=0.4,0.9", "--seeds", "1", "--jobs", "1"]
+    assert start(*words) == USAGE
+    assert "no metric 'eval/episode_return'" in capsys.readouterr().err
+    assert start(*words) == SUCCESS and rows()[0]["ppo.gamma"] == "0.9"
+
+
+@pytest.mark.slow
+def test_a_name_is_no_reason(place, capsys):
+    Path("sweeps/process1").mkdir(parents=True)
+    Path("sweeps/process1/x").touch()
+    assert start(*RATES, "--name", "process1") == USAGE
+    said = capsys.readouterr().err
+    assert said == (
+        "purerl: sweeps/process1 holds no sweep, but other files; use another --name.\n"
+    )
 
 
 @pytest.mark.slow
@@ -141,7 +245,25 @@ def test_optuna_goes_on_where_it_was(place):
 
 @pytest.mark.slow
 @has("optuna")
-def test_optuna_is_told_of_failures(place):
+def test_optuna_tries_what_failed_once_more(place):
+    words = ["--over", "ppo.learning-rate=log:1e-4:1e-1", "--optuna", "2", "--seeds", "1"]
+    Path("FAIL").touch()
+    assert start(*words, "--jobs", "1") == FAILURE
+    assert [row["status"] for row in rows()] == ["failed", "failed"]
+    failed = {row["point"]: row["ppo.learning-rate"] for row in rows()}
+    Path("FAIL").unlink()
+    assert start(*words, "--jobs", "1") == SUCCESS
+    assert [row["status"] for row in rows()] == ["done", "done"]
+    assert {row["point"]: row["ppo.learning-rate"] for row in rows()} == failed
+    from purerl.tune.sweep import study
+
+    trials = study.open_study(Path("sweeps/toy_experiment")).get_trials()
+    assert None not in [trial.value for trial in trials]
+
+
+@pytest.mark.slow
+@has("optuna")
+def test_optuna_chooses_no_more_for_what_failed(place):
     words = ["--over", "ppo.gamma=0.5,0.6", "--optuna", "2", "--seeds", "1"]
     assert start(*words) == FAILURE
     assert [row["status"] for row in rows()] == ["failed", "failed"]
