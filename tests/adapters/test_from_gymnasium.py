@@ -181,7 +181,7 @@ def test_a_mujoco_environment_is_stepped_as_by_itself_and_drawn():
     theirs = gymnasium.make("HalfCheetah-v5")
     state = env.reset(jax.random.key(1))
     seed = [int(x) for x in state.task[0]]
-    seen, _ = theirs.reset(seed=seed[0] << 32 | seed[1])
+    seen, _ = theirs.reset(seed=int(np.random.SeedSequence(seed).generate_state(1)[0]))
     np.testing.assert_allclose(state.observation, seen, rtol=1e-6)
     for i in range(4):
         action = np.full(6, 0.5 * (-1) ** i, np.float32)  # exact between the limits
