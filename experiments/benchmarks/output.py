@@ -1,8 +1,10 @@
 """The `type` of an argument that names a file to write, or is a count."""
 
 import argparse
-import os
 from pathlib import Path
+
+from purerl.core.errors import UserError
+from purerl.runs.files import check_writable
 
 
 def output_file(name: str) -> str:
@@ -11,11 +13,11 @@ def output_file(name: str) -> str:
     Raises:
       argparse.ArgumentTypeError: it cannot be written, which is better known before measuring.
     """
-    folder = Path(name).absolute().parent
-    if name and (not os.access(folder, os.W_OK) or Path(name).is_dir()):
-        raise argparse.ArgumentTypeError(
-            f"{name} cannot be written: is {folder} a folder of yours?"
-        )
+    try:
+        if name:
+            check_writable(Path(name))
+    except UserError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
     return name
 
 
