@@ -14,6 +14,7 @@ import gymnasium  # noqa: E402
 from envs import gymnasium_ant  # noqa: E402
 from purerl.core.errors import UserError  # noqa: E402
 from purerl.runs.check_env import check_env  # noqa: E402
+from tests import quick  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -114,9 +115,9 @@ def test_braxs_environment_keeps_to_the_protocol_and_steps_as_braxs():
 
     env = brax_env.build(brax_env.Options(backend="positional"))  # the quickest to compile
     check_env(env)
-    key, step = jax.random.key(0), jax.jit(env.step)
-    ours, theirs = jax.jit(env.reset)(jax.random.clone(key)), jax.jit(env.env.reset)(key)
-    their_step = jax.jit(env.env.step)
+    key, step = jax.random.key(0), quick.jit(env.step)
+    ours, theirs = quick.jit(env.reset)(jax.random.clone(key)), quick.jit(env.env.reset)(key)
+    their_step = quick.jit(env.env.step)
     for i in range(10):
         action = jnp.full(env.action_size, (-1.0) ** i)
         ours, theirs = step(ours, action), their_step(theirs, action)
@@ -146,10 +147,10 @@ def test_braxs_body_moves_on_our_physics_as_on_braxs(body):
     ours, theirs = (
         brax_env.build(brax_env.Options(body, physics), "jax") for physics in ("purerl", "mjx")
     )
-    our_step, their_step = jax.jit(ours.step), jax.jit(theirs.step)
+    our_step, their_step = quick.jit(ours.step), quick.jit(theirs.step)
     state, reached = (
-        jax.jit(ours.reset)(jax.random.key(0)),
-        jax.jit(theirs.reset)(jax.random.key(0)),
+        quick.jit(ours.reset)(jax.random.key(0)),
+        quick.jit(theirs.reset)(jax.random.key(0)),
     )
     for i in range(20):
         # From brax's state each time: contacts make the smallest difference grow.
