@@ -36,7 +36,7 @@ LONGEST = ("shards", "run", "interface", "seeds", "algorithm", "suite", "probes"
 
 @pytest.fixture(scope="module", autouse=True)
 def garbage_is_collected_after_a_file():
-    """Tracing makes millions of objects, and no garbage: looking for it took a sixth of the time."""
+    """Tracing makes millions of objects, no garbage: looking for it was a sixth of the time."""
     gc.disable()
     yield
     gc.enable()
