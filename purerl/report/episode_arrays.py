@@ -64,6 +64,7 @@ def play(
             "state": now.env,
             "action": action,
             "reward": following.env.reward,
+            "terminated": following.env.terminated,
             "value": output.value,
             "memory": now.memory,
             "network": noted,

@@ -91,3 +91,11 @@ class Options:
     def vmapped_seeds(self) -> int:
         """How many seeds share one program; 1 if each is trained by itself."""
         return self.num_seeds if self.seeds_by == "vmap" else 1
+
+    def check_shards(self, number: int) -> None:
+        """Raises UserError where vmapped seeds would have that many shards."""
+        if self.vmapped_seeds > 1 and number > 1:
+            raise UserError(
+                f"num_shards is {number}, and {self.num_seeds} vmapped seeds share one program "
+                "on one device; use --seeds-by map, or leave out --num-shards."
+            )

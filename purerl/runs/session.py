@@ -162,14 +162,8 @@ def _shards_on_disk(folders: Iterable[Path]) -> int:
 def _choose_shards(config: Config, abstract: PyTree, options: Options, begun_with: int) -> Shards:
     """Returns the shards asked for, or those of the run that goes on, or one for each device."""
     number, devices = options.num_shards or begun_with, jax.device_count()
-    if options.vmapped_seeds > 1:
-        if number > 1:
-            raise UserError(
-                f"num_shards is {number}, and {options.num_seeds} vmapped seeds share one program "
-                "on one device; use --seeds-by map, or leave out --num-shards."
-            )
-        number = 1
-    number = number or devices
+    options.check_shards(number)
+    number = 1 if options.vmapped_seeds > 1 else number or devices
     if number == 1 and jax.process_count() > 1:
         raise UserError(
             f"num_shards is 1, which one device computes, and there are {jax.process_count()} "

@@ -16,6 +16,7 @@ from purerl.ppo import running_moments
 from purerl.ppo.networks import GaussianHead, PolicyOptions
 from purerl.report import episode_arrays
 from purerl.runs import restored_run
+from tests.runs.test_run import TOY
 
 TRAIN = """
 import dataclasses
@@ -111,6 +112,18 @@ def test_a_memory_is_what_the_step_before_left(lstm):
         left = arrays[f"network/cell.0.{i}"][:, :-1]
         # XLA computes it once to be noted and once to be kept, and may round each otherwise.
         np.testing.assert_allclose(memory[:, 1:], left, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize(("steps", "length", "ends"), [(4, 4, True), (12, 10, False)])
+def test_an_end_before_the_time_limit_is_told_from_the_limit(tmp_path, steps, length, ends):
+    runs, out = tmp_path / "runs", tmp_path / "out.npz"
+    words = ["--env.steps", str(steps), "--runs", str(runs), "--evaluation.number", "0"]
+    assert run.main([str(TOY), *words]) == 0
+    folder = runs / "toy_experiment" / "seed1"
+    assert record.main([str(folder), "--episodes", "2", "--out", str(out)]) == 0
+    arrays = np.load(out)
+    assert arrays["length"].tolist() == [length] * 2
+    assert arrays["terminated"].tolist() == [[False] * (length - 1) + [ends]] * 2
 
 
 def test_a_module_that_is_applied_twice_is_noted_twice():

@@ -100,7 +100,7 @@ def read(arguments: Sequence[str]) -> tuple[Options, Base, list[str]]:
             raise UserError(f"{word} is no option of a sweep's runs; {instead}.")
     check(options)
     of_run = dataclasses.replace(of_run, num_seeds=options.seeds)
-    check_shards(of_run)
+    of_run.check_shards(of_run.num_shards)  # as each run would, after JAX has begun
     return options, base._replace(chosen=chosen, words=tuple(rest), options=of_run), given
 
 
@@ -121,15 +121,6 @@ def check(options: Options) -> None:
         raise UserError(
             "--optuna chooses a point when others have ended, and --slurm submits all at once; "
             "leave one of them out."
-        )
-
-
-def check_shards(of_run: RunOptions) -> None:
-    """Raises UserError where every run would: `runs/session.py` has the same rule, behind JAX."""
-    if of_run.vmapped_seeds > 1 and of_run.num_shards > 1:
-        raise UserError(
-            f"num_shards is {of_run.num_shards}, and {of_run.num_seeds} vmapped seeds share one "
-            "program on one device; use --seeds-by map, or leave out --num-shards."
         )
 
 
