@@ -11,7 +11,8 @@ returns from `reward` here. Every array but `length` is [N, T, ...]: N episodes 
     task/...            what the environment remembers besides: the corridor's gaps, a target
     metrics/...         the environment's, before the step
     action [A]          in [-1, 1]; `reward` of the step that it began; `value` of the observation
-    terminated          whether the step ended the episode; if none did, its time limit was reached
+    terminated          whether the step ended the episode; if none did, its time limit was reached,
+                        or the simulation was lost
     memory/...          of a recurrent network, before the step
     network/MODULE      what each module of a Flax network returned: `network/policy/Dense_0` is a
                         layer before its activation, `network/policy` the last one after it,

@@ -92,7 +92,7 @@ class Options:
         """How many seeds share one program; 1 if each is trained by itself."""
         return self.num_seeds if self.seeds_by == "vmap" else 1
 
-    def check_shards(self, number: int) -> None:
+    def check_vmapped(self, number: int) -> None:
         """Raises UserError where vmapped seeds would have that many shards."""
         if self.vmapped_seeds > 1 and number > 1:
             raise UserError(

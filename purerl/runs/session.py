@@ -162,7 +162,7 @@ def _shards_on_disk(folders: Iterable[Path]) -> int:
 def _choose_shards(config: Config, abstract: PyTree, options: Options, begun_with: int) -> Shards:
     """Returns the shards asked for, or those of the run that goes on, or one for each device."""
     number, devices = options.num_shards or begun_with, jax.device_count()
-    options.check_shards(number)
+    options.check_vmapped(number)
     number = 1 if options.vmapped_seeds > 1 else number or devices
     if number == 1 and jax.process_count() > 1:
         raise UserError(

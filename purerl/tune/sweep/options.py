@@ -100,7 +100,7 @@ def read(arguments: Sequence[str]) -> tuple[Options, Base, list[str]]:
             raise UserError(f"{word} is no option of a sweep's runs; {instead}.")
     check(options)
     of_run = dataclasses.replace(of_run, num_seeds=options.seeds)
-    of_run.check_shards(of_run.num_shards)  # as each run would, after JAX has begun
+    of_run.check_vmapped(of_run.num_shards)  # as each run would, after JAX has begun
     return options, base._replace(chosen=chosen, words=tuple(rest), options=of_run), given
 
 
