@@ -17,8 +17,8 @@ import mujoco
 from dm_control import mjcf
 from dm_control.locomotion.arenas import corridors, floors
 
-from envs.bodies import Body
 from purerl import Array
+from purerl.envs.bodies import Body
 
 GROUND = "ground"  # the floor's geom; a corridor's boxes are ground_0, ground_1, ...
 _THICKNESS = 0.16  # half height of a platform, as in dm_control [m]

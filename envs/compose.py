@@ -12,9 +12,9 @@ import mujoco
 import numpy as np
 from dm_control import mjcf
 
-from envs.arenas import GROUND, Arena, BoxFields, box_fields, build_arena, check_passable
-from envs.bodies import Body
 from purerl import choose_engine, lookup
+from purerl.envs.arenas import GROUND, Arena, BoxFields, box_fields, build_arena, check_passable
+from purerl.envs.bodies import Body
 
 PREFIX = "walker/"  # composing puts it before the names of the body's parts
 TORSO_VELOCITY = "torso_velocity"  # a sensor of the walker's centre of mass [m/s]
@@ -52,8 +52,8 @@ def compose(
     `spawn_height`, at x = 0 on a floor and at `spawn_x` in a corridor.
 
     Args:
-      body: of `envs.bodies`.
-      arena: of `envs.arenas`.
+      body: of `purerl.envs.bodies`.
+      arena: of `purerl.envs.arenas`.
       engine: as for `purerl.physics.interface.Physics`; decides the solver's settings only.
       timestep: of physics [s]; the body's own if None.
       self_collision: whether parts of the body can touch each other.

@@ -11,7 +11,8 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
-from envs.arenas import (
+from purerl import Array, Physics, PhysicsState, State, lookup, overflow_metric, overflow_reading
+from purerl.envs.arenas import (
     Arena,
     Floor,
     GapsCorridor,
@@ -22,9 +23,8 @@ from envs.arenas import (
     gaps_crossed,
     platform_boxes,
 )
-from envs.bodies import ANT, RODENT, Body
-from envs.compose import Composed, compose
-from purerl import Array, Physics, PhysicsState, State, lookup, overflow_metric, overflow_reading
+from purerl.envs.bodies import ANT, RODENT, Body
+from purerl.envs.compose import Composed, compose
 
 BODIES = {"ant": ANT, "rodent": RODENT}
 READINGS = ("xpos", "xmat", "subtree_com", "actuator_force")

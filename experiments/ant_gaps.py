@@ -6,8 +6,8 @@ Expected: 18 gaps of 19 in unseen corridors, after 6 min on two CPU cores. Ten s
 at the lower quartile, 17.2 at least.
 """
 
-from envs import run
 from purerl import Config, Evaluation, Experiment, networks
+from purerl.envs import run
 
 experiment = Experiment(
     build_env=run.build,

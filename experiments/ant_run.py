@@ -6,8 +6,8 @@ Expected: 4.8 m/s after 9 to 13 min, two seeds at a time on two CPU cores.
 Ten seeds: 4.72 m/s at the lower quartile, 4.61 at least.
 """
 
-from envs import run
 from purerl import Config, Evaluation, Experiment, networks
+from purerl.envs import run
 
 experiment = Experiment(
     build_env=run.build,

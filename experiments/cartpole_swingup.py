@@ -5,8 +5,8 @@ python -m purerl.run cartpole_swingup
 Expected: return 936 or 942 of 1000 after 14 to 21 s, on two CPU cores.
 """
 
-from envs import cartpole_swingup
 from purerl import Config, Evaluation, Experiment, networks
+from purerl.envs import cartpole_swingup
 
 experiment = Experiment(
     build_env=cartpole_swingup.build,

@@ -11,8 +11,8 @@ import dataclasses
 import flax.linen as nn
 import jax.numpy as jnp
 
-from envs import cartpole_swingup
 from purerl import Array, Config, Experiment, Network, Normal, PolicyOutput, networks
+from purerl.envs import cartpole_swingup
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,8 +14,8 @@ comes while the learning rate falls. A policy of `rodent_run`, which does not se
 `docs/measurements/gpu.md` has their curves, and other rewards and settings.
 """
 
-from envs import run
 from purerl import Config, Evaluation, Experiment, networks
+from purerl.envs import run
 
 experiment = Experiment(
     build_env=run.build,

@@ -6,8 +6,8 @@ Expected: 2.4 m/s over 10 s episodes, head first, after 20 min on two CPU cores.
 GPU (engine `warp`, 22 min): 2.19 m/s at the lower quartile, 2.08 at least.
 """
 
-from envs import run
 from purerl import Config, Evaluation, Experiment, networks
+from purerl.envs import run
 
 experiment = Experiment(
     build_env=run.build,

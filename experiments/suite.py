@@ -7,8 +7,8 @@ The settings are the defaults: `purerl/ppo/config.py` and `networks.py` say why.
 nothing with these: `suite_humanoid` has settings for them. A GPU: `suite_gpu`.
 """
 
-from envs.suite import tasks
 from purerl import Config, Evaluation, Experiment, networks
+from purerl.envs.suite import tasks
 
 experiment = Experiment(
     build_env=tasks.build,

@@ -10,7 +10,7 @@ trained: docs/measurements/suite.md. Humanoids: `suite_humanoid`.
 
 import dataclasses
 
-from experiments import suite
+from purerl.experiments import suite
 
 experiment = dataclasses.replace(
     suite.experiment,

@@ -9,8 +9,8 @@ after 40 M steps). Each that begins gets up within 2 s. On a CPU core a seed tak
 
 import dataclasses
 
-from envs.suite import tasks
-from experiments import suite_gpu
+from purerl.envs.suite import tasks
+from purerl.experiments import suite_gpu
 
 experiment = dataclasses.replace(
     suite_gpu.experiment,

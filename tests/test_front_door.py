@@ -23,6 +23,7 @@ NAMES = [
     "train",
 ]  # fmt: skip
 MODULES = {"adapters", "exact", "lookup", "networks", "planner"}
+BESIDE = ("purerl.envs", "purerl.experiments")  # of this repository, as these files themselves
 # They measure the insides.
 INSIDERS = {"benchmarks", "peers"}
 
@@ -134,6 +135,8 @@ def test_environments_and_experiments_import_the_front_door_and_nothing_deeper(f
     for node in ast.walk(ast.parse(file.read_text())):
         if isinstance(node, ast.Import):
             assert not [a.name for a in node.names if a.name.startswith("purerl.")]
+        if isinstance(node, ast.ImportFrom) and node.module.startswith(BESIDE):
+            continue
         if isinstance(node, ast.ImportFrom) and node.module.split(".")[0] == "purerl":
             assert node.module == "purerl", f"line {node.lineno}"
             assert {alias.name for alias in node.names} <= set(NAMES), f"line {node.lineno}"

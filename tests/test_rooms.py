@@ -24,6 +24,8 @@ MAY_IMPORT = {
     "adapters": {"core", "ppo", "physics"},
     "tune": {"core", "ppo", "devices", "runs", "report"},
 }
+# The folders beside `purerl/`, which are `purerl.envs` and so on for who imports them.
+LINKS = {"envs", "experiments", "assets"}
 # Files beside the rooms. The command `report` is the room of that name, by its __main__.py.
 COMMANDS = {
     "check", "compare", "evaluate", "export", "new", "plan", "plot", "record", "render", "run",
@@ -79,7 +81,8 @@ def test_nothing_but_rooms_and_commands():
     beside = {path.stem for path in HOUSE.glob("*.py")}
     assert beside == COMMANDS | {"__init__", "__main__"}
     folders = {path.name for path in HOUSE.iterdir() if path.is_dir()} - {"__pycache__"}
-    assert folders == set(MAY_IMPORT) and len(folders) <= 9
+    assert folders == set(MAY_IMPORT) | LINKS
+    assert all((HOUSE / link).resolve() == ROOT / link for link in LINKS)
 
 
 @pytest.mark.parametrize("room", MAY_IMPORT)
@@ -125,8 +128,8 @@ def test_no_circles():
 
 def test_the_library_imports_no_environment_and_no_experiment():
     for name, path in MODULES.items():
-        roots = {other.split(".")[0] for other in imported(path)}
-        assert not roots & {"envs", "experiments", "tests"}, name
+        found = {other.removeprefix("purerl.").split(".")[0] for other in imported(path)}
+        assert not found & (LINKS | {"tests"}), name
 
 
 @pytest.mark.parametrize("name", [n for n in MODULES if room_of(n) in PURE])

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from dm_control.suite import acrobot
 
-from envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, make_env
-from envs.suite.rewards import tolerance
 from purerl import Array, lookup
+from purerl.envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, make_env
+from purerl.envs.suite.rewards import tolerance
 
 MARGINS = {"swingup": 1.0, "swingup_sparse": 0.0}  # of the tip's distance to the target [m]
 READINGS = ("xmat", "site_xpos")

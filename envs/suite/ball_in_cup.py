@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 from dm_control.suite import ball_in_cup
 
-from envs.suite.base import (
+from purerl import Array, Physics, lookup
+from purerl.envs.suite.base import (
     Moment,
     Start,
     SuiteEnv,
@@ -15,7 +16,6 @@ from envs.suite.base import (
     make_env,
     touching_pairs,
 )
-from purerl import Array, Physics, lookup
 
 CANDIDATES = 8  # starting places to draw, to have one in which the ball touches nothing
 READINGS = ("xpos", "site_xpos")

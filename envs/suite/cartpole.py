@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from dm_control.suite import cartpole
 
-from envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, make_env
-from envs.suite.rewards import tolerance
 from purerl import Array, lookup
+from purerl.envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, make_env
+from purerl.envs.suite.rewards import tolerance
 
 TASKS = ("balance", "balance_sparse", "swingup", "swingup_sparse")
 CART_LIMIT = 0.25  # how far from the middle a sparse task still rewards [m]

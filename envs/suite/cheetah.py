@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from dm_control.suite import cheetah
 
-from envs.suite.base import Moment, Start, SuiteEnv, load_model, make_env
-from envs.suite.rewards import tolerance
 from purerl import Array, Physics, lookup
+from purerl.envs.suite.base import Moment, Start, SuiteEnv, load_model, make_env
+from purerl.envs.suite.rewards import tolerance
 
 RUN_SPEED = 10.0  # [m/s]
 SETTLING = 200  # physics steps from the random pose to the start of the episode

@@ -13,7 +13,8 @@ import mujoco
 import numpy as np
 from dm_control.suite import finger
 
-from envs.suite.base import (
+from purerl import Array, Physics, lookup
+from purerl.envs.suite.base import (
     Moment,
     Start,
     SuiteEnv,
@@ -24,7 +25,6 @@ from envs.suite.base import (
     random_joints,
     touching_pairs,
 )
-from purerl import Array, Physics, lookup
 
 TARGET_SIZES = {"spin": 0.0, "turn_easy": 0.07, "turn_hard": 0.03}  # radius [m]; 0: no target
 SPIN = 15.0  # [rad/s], in the negative direction

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import mujoco
 from dm_control.suite import fish
 
-from envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, make_env
-from envs.suite.rewards import tolerance
 from purerl import Array, lookup
+from purerl.envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, make_env
+from purerl.envs.suite.rewards import tolerance
 
 TASKS = ("upright", "swim")
 JOINTS = ("tail1", "tail_twist", "tail2") + tuple(

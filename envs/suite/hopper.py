@@ -7,9 +7,17 @@ import mujoco
 import numpy as np
 from dm_control.suite import hopper
 
-from envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, make_env, random_joints
-from envs.suite.rewards import tolerance
 from purerl import Array, lookup
+from purerl.envs.suite.base import (
+    Moment,
+    Start,
+    SuiteEnv,
+    check_task,
+    load_model,
+    make_env,
+    random_joints,
+)
+from purerl.envs.suite.rewards import tolerance
 
 TASKS = ("stand", "hop")
 STAND_HEIGHT = 0.6  # torso above foot [m]

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from dm_control.suite import humanoid
 
-from envs.suite.base import (
+from purerl import Array, Physics, lookup
+from purerl.envs.suite.base import (
     Moment,
     Start,
     SuiteEnv,
@@ -18,8 +19,7 @@ from envs.suite.base import (
     random_joints,
     touching_pairs,
 )
-from envs.suite.rewards import tolerance
-from purerl import Array, Physics, lookup
+from purerl.envs.suite.rewards import tolerance
 
 SPEEDS = {"stand": 0.0, "walk": 1.0, "run": 10.0}  # [m/s]
 STAND_HEIGHT = 1.4  # of the head [m]

@@ -11,7 +11,8 @@ import mujoco
 import numpy as np
 from dm_control.suite import manipulator
 
-from envs.suite.base import (
+from purerl import Array, Physics, lookup
+from purerl.envs.suite.base import (
     Moment,
     Start,
     SuiteEnv,
@@ -21,8 +22,7 @@ from envs.suite.base import (
     make_env,
     touching_pairs,
 )
-from envs.suite.rewards import tolerance
-from purerl import Array, Physics, lookup
+from purerl.envs.suite.rewards import tolerance
 
 CLOSE = 0.01  # of the ball to the target [m]
 IN_HAND, IN_TARGET = 0.1, 0.1  # chances that the ball starts there; else it is anywhere

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from dm_control.suite import pendulum
 
-from envs.suite.base import Moment, Start, SuiteEnv, load_model, make_env
-from envs.suite.rewards import tolerance
 from purerl import Array, lookup
+from purerl.envs.suite.base import Moment, Start, SuiteEnv, load_model, make_env
+from purerl.envs.suite.rewards import tolerance
 
 READINGS = ("xmat",)
 UPRIGHT = float(np.cos(np.deg2rad(8)))  # cosine of the angle within which it is up

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import mujoco
 from dm_control.suite import point_mass
 
-from envs.suite.base import Moment, Start, SuiteEnv, load_model, make_env, random_joints
-from envs.suite.rewards import tolerance
 from purerl import Array, lookup
+from purerl.envs.suite.base import Moment, Start, SuiteEnv, load_model, make_env, random_joints
+from purerl.envs.suite.rewards import tolerance
 
 READINGS = ("geom_xpos",)
 

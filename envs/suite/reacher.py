@@ -11,9 +11,17 @@ import mujoco
 import numpy as np
 from dm_control.suite import reacher
 
-from envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, make_env, random_joints
-from envs.suite.rewards import tolerance
 from purerl import Array, lookup
+from purerl.envs.suite.base import (
+    Moment,
+    Start,
+    SuiteEnv,
+    check_task,
+    load_model,
+    make_env,
+    random_joints,
+)
+from purerl.envs.suite.rewards import tolerance
 
 TARGET_SIZES = {"easy": 0.05, "hard": 0.015}  # radius [m]
 READINGS = ("geom_xpos",)

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import mujoco
 from dm_control.suite import swimmer
 
-from envs.suite.base import Moment, Start, SuiteEnv, load_model, make_env, random_joints
-from envs.suite.rewards import tolerance
 from purerl import Array, lookup
+from purerl.envs.suite.base import Moment, Start, SuiteEnv, load_model, make_env, random_joints
+from purerl.envs.suite.rewards import tolerance
 
 NEAR, FAR, NEAR_CHANCE = 0.3, 2.0, 0.2  # half-width of the target's square [m], and its chance
 READINGS = ("geom_xpos", "xmat", "sensordata")

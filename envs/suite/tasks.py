@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from envs.suite import (
+from purerl.envs.suite import (
     acrobot,
     ball_in_cup,
     cartpole,
@@ -19,7 +19,7 @@ from envs.suite import (
     swimmer,
     walker,
 )
-from envs.suite.base import SuiteEnv, check_task
+from purerl.envs.suite.base import SuiteEnv, check_task
 
 TASKS: dict[str, tuple[Any, Any]] = {  # name -> the domain's module and its options
     "acrobot-swingup": (acrobot, acrobot.Options("swingup")),

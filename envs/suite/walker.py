@@ -7,9 +7,17 @@ import mujoco
 import numpy as np
 from dm_control.suite import walker
 
-from envs.suite.base import Moment, Start, SuiteEnv, check_task, load_model, make_env, random_joints
-from envs.suite.rewards import tolerance
 from purerl import Array, lookup
+from purerl.envs.suite.base import (
+    Moment,
+    Start,
+    SuiteEnv,
+    check_task,
+    load_model,
+    make_env,
+    random_joints,
+)
+from purerl.envs.suite.rewards import tolerance
 
 SPEEDS = {"stand": 0.0, "walk": 1.0, "run": 8.0}  # [m/s]
 STAND_HEIGHT = 1.2  # of the torso [m]

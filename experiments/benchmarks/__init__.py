@@ -1,5 +1,5 @@
 """Measurements of this library: speed, memory, start-up, every environment, gaps crossed.
 
 They measure the insides, so they import the rooms of `purerl` and not only its front door:
-`python -m experiments.benchmarks.scaling --help`.
+`python -m purerl.experiments.benchmarks.scaling --help`.
 """

@@ -1,8 +1,8 @@
 """Where time and memory go: physics, rollout, learner, update, evaluation of an experiment.
 
-    python -m experiments.benchmarks.benchmark ant_run
-    python -m experiments.benchmarks.benchmark ant_run --engine jax --json out.json
-    python -m experiments.benchmarks.benchmark ant_run --start-up    # time to the first update
+    python -m purerl.experiments.benchmarks.benchmark ant_run
+    python -m purerl.experiments.benchmarks.benchmark ant_run --engine jax --json out.json
+    python -m purerl.experiments.benchmarks.benchmark ant_run --start-up # time to the first update
 
 Each part is compiled by itself and timed in rounds, part after part, so that a busy moment of the
 machine falls on all of them; the median of the rounds counts. Rates are control steps per second.
@@ -29,11 +29,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from experiments.benchmarks import start_up
-from experiments.benchmarks.output import count, output_file
 from purerl import exact
 from purerl.core.parts import WHOLE
 from purerl.core.records import Array, Network, PyTree, TrainState
+from purerl.experiments.benchmarks import start_up
+from purerl.experiments.benchmarks.output import count, output_file
 from purerl.physics.lookup import scale_action
 from purerl.ppo import algorithm, learner
 from purerl.ppo.evaluation import evaluate
@@ -241,7 +241,7 @@ def main(arguments: list[str]) -> int:
     if options.start_up:
         return start_up.main([options.experiment, *overrides])
     exact.set_xla_flags()  # as a run does, before JAX starts
-    prog = f"python -m experiments.benchmarks.benchmark {options.experiment}"
+    prog = f"python -m purerl.experiments.benchmarks.benchmark {options.experiment}"
     experiment, _ = command_line.from_command_line(find_source(options.experiment), overrides, prog)
     bench = make_bench(experiment, options.parts)
     timings = measure(bench.parts, options.rounds, options.least_s)

@@ -1,7 +1,7 @@
 """Every environment on every engine: does it keep the contract, and how fast is it?
 
-    python -m experiments.benchmarks.every_environment
-    python -m experiments.benchmarks.every_environment --engines c --only rodent_gaps walker-walk
+    python -m purerl.experiments.benchmarks.every_environment
+    python -m purerl.experiments.benchmarks.every_environment --engines c --only walker-walk
 
 A row has control steps/s of the bare engine under random controls, of the rollout (policy, reward,
 observations and resets included), and the rollout's share; both timed in turns in one process.
@@ -13,10 +13,10 @@ from functools import partial
 
 import jax
 
-from envs.suite.tasks import TASKS, Options as SuiteOptions
-from experiments.benchmarks.benchmark import bare_physics, compile_part, measure
-from experiments.benchmarks.output import count
 from purerl.core.errors import UserError, one_line
+from purerl.envs.suite.tasks import TASKS, Options as SuiteOptions
+from purerl.experiments.benchmarks.benchmark import bare_physics, compile_part, measure
+from purerl.experiments.benchmarks.output import count
 from purerl.ppo import algorithm
 from purerl.ppo.rollout import rollout
 from purerl.runs import build_experiment
@@ -65,7 +65,9 @@ def main() -> int:
     """Prints the table; exit code 1 if an environment breaks the contract."""
     plain = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
-        "experiments.benchmarks.every_environment", description=__doc__, formatter_class=plain
+        "purerl.experiments.benchmarks.every_environment",
+        description=__doc__,
+        formatter_class=plain,
     )
     experiments = all_experiments()
     parser.add_argument("--engines", nargs="+", default=["c", "jax"])

@@ -1,6 +1,6 @@
 r"""How many gaps a policy crosses in corridors that it has never seen, beside simpler policies.
 
-    python -m experiments.benchmarks.gaps_crossed runs/rodent_gaps/seed1 \
+    python -m purerl.experiments.benchmarks.gaps_crossed runs/rodent_gaps/seed1 \
         --floor-run runs/rodent_run/seed1
 
 The floor policy is one trained without gaps: put into the corridor, it does not see them (what

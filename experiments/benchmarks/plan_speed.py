@@ -1,7 +1,7 @@
 """How fast the planner plans, and what share of that is MuJoCo: a line for each body.
 
-    python -m experiments.benchmarks.plan_speed
-    python -m experiments.benchmarks.plan_speed ant_gaps --samples 16 64 256 --horizon 25 50
+    python -m purerl.experiments.benchmarks.plan_speed
+    python -m purerl.experiments.benchmarks.plan_speed ant_gaps --samples 16 64 256 --horizon 25 50
 
 A body moves for some control steps, a plan before each. Then the rows that these plans stepped are
 stepped once more, by MuJoCo alone: the same states, actions and changes of the model, none of ours
@@ -20,10 +20,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.suite.tasks import TASKS
-from experiments.benchmarks.output import count
-from experiments.benchmarks.plan_suite import experiment_of
 from purerl.devices.compilation import set_up_jax
+from purerl.envs.suite.tasks import TASKS
+from purerl.experiments.benchmarks.output import count
+from purerl.experiments.benchmarks.plan_suite import experiment_of
 from purerl.physics import engine_c
 from purerl.runs.build_experiment import build
 from purerl.runs.command_errors import leave
@@ -132,7 +132,7 @@ def main() -> int:
     """Prints a line for each body, number of samples and horizon."""
     plain = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
-        "experiments.benchmarks.plan_speed", description=__doc__, formatter_class=plain
+        "purerl.experiments.benchmarks.plan_speed", description=__doc__, formatter_class=plain
     )
     known = [*TASKS, *available()]
     parser.add_argument("bodies", nargs="*", metavar="BODY", help="all of the table by default")

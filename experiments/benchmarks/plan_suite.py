@@ -1,8 +1,8 @@
 """What the planner returns on tasks, without learning: a row of a CSV file for each episode.
 
-    nice -n 15 python -m experiments.benchmarks.plan_suite --out plan_suite.csv
-    python -m experiments.benchmarks.plan_suite --only hopper-hop --planners cem --steps 200
-    python -m experiments.benchmarks.plan_suite --runs runs/suite/hopper-hop --out beside.csv
+    nice -n 15 python -m purerl.experiments.benchmarks.plan_suite --out plan_suite.csv
+    python -m purerl.experiments.benchmarks.plan_suite --only hopper-hop --planners cem --steps 200
+    python -m purerl.experiments.benchmarks.plan_suite --runs runs/suite/hopper-hop --out beside.csv
 
 Of a run there are rows for its policy alone ("policy"), for planners without it, and for planners
 that correct it ("mppi+policy"), on the same beginnings. What the last ones find beyond the policy,
@@ -24,10 +24,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from envs.suite.tasks import TASKS, Options as SuiteOptions
-from experiments.benchmarks.output import count, output_file
 from purerl.core.errors import UserError
 from purerl.devices.compilation import set_up_jax
+from purerl.envs.suite.tasks import TASKS, Options as SuiteOptions
+from purerl.experiments.benchmarks.output import count, output_file
 from purerl.runs.build_experiment import build
 from purerl.runs.command_errors import leave
 from purerl.runs.experiment import Experiment, available, find
@@ -128,7 +128,7 @@ def main() -> int:
     """Plays what is missing, and prints the table."""
     plain = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
-        "experiments.benchmarks.plan_suite", description=__doc__, formatter_class=plain
+        "purerl.experiments.benchmarks.plan_suite", description=__doc__, formatter_class=plain
     )
     default = [*MUST_SHOW, "ant_gaps"]
     known = [*TASKS, *(set(available()) - {"suite"})]

@@ -1,7 +1,7 @@
 """How cost grows: steps/s and memory over environments, rollout length, width, cores and seeds.
 
-    python -m experiments.benchmarks.scaling --csv docs/measurements/scaling.csv
-    python -m experiments.benchmarks.scaling --engine jax --minibatch 4096   # on a GPU
+    python -m purerl.experiments.benchmarks.scaling --csv docs/measurements/scaling.csv
+    python -m purerl.experiments.benchmarks.scaling --engine jax --minibatch 4096   # on a GPU
 
 One axis varies, the rest stays as the experiment and its overrides have it; a minibatch holds at
 most `--minibatch` samples, so that the learner's work for a sample is the same everywhere. Each
@@ -25,10 +25,10 @@ from typing import Any, NamedTuple
 
 import jax
 
-from experiments.benchmarks.benchmark import compile_part, measure
-from experiments.benchmarks.output import output_file
 from purerl import exact
 from purerl.core.errors import UserError
+from purerl.experiments.benchmarks.benchmark import compile_part, measure
+from purerl.experiments.benchmarks.output import output_file
 from purerl.ppo import algorithm
 from purerl.runs import build_experiment
 from purerl.runs.command_errors import leave
@@ -83,7 +83,7 @@ def point(sweep: Sweep, axis: str, value: int) -> dict[str, Any]:
         command = [
             sys.executable,
             "-m",
-            "experiments.benchmarks.benchmark",
+            "purerl.experiments.benchmarks.benchmark",
             sweep.name,
             *sweep.words,
         ]
@@ -164,7 +164,7 @@ def main(arguments: list[str]) -> int:
     if options.minibatch < 1:
         parser.error(f"--minibatch is {options.minibatch}; it must be at least 1.")
     seeds = find_source(options.seeds_experiment).experiment
-    prog = "python -m experiments.benchmarks.scaling"
+    prog = "python -m purerl.experiments.benchmarks.scaling"
     experiment, _ = from_command_line(find_source(options.experiment), words, prog)
     sweep = Sweep(options.experiment, words, experiment.ppo, options.minibatch)
     exact.set_xla_flags()  # for seeds, in this process

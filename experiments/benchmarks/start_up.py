@@ -1,7 +1,7 @@
 """How long a start takes: from the command to the first update, with an empty cache and a full one.
 
-    python -m experiments.benchmarks.start_up cartpole_swingup ant_run --engines c jax
-    python -m experiments.benchmarks.start_up ant_run --engines jax --ppo.num-envs 4096
+    python -m purerl.experiments.benchmarks.start_up cartpole_swingup ant_run --engines c jax
+    python -m purerl.experiments.benchmarks.start_up ant_run --engines jax --ppo.num-envs 4096
 
 Each start is `python -m purerl.run` in a process of its own, ended after its first update. The
 first start finds an empty compilation cache, the second one the cache that the first filled.

@@ -1,9 +1,9 @@
 """Trains control suite tasks by seeds, and scores them beside what others published.
 
-    python -m experiments.benchmarks.suite_benchmark                       # every task: hours
-    python -m experiments.benchmarks.suite_benchmark cheetah-run hopper-hop --steps 3000000
-    python -m experiments.benchmarks.suite_benchmark --gpu --engine warp   # settings for a GPU
-    python -m experiments.benchmarks.suite_benchmark --scores mine.csv runs/suite  # no training
+    python -m purerl.experiments.benchmarks.suite_benchmark # every task: hours
+    python -m purerl.experiments.benchmarks.suite_benchmark cheetah-run hopper-hop --steps 3000000
+    python -m purerl.experiments.benchmarks.suite_benchmark --gpu --engine warp # on a GPU
+    python -m purerl.experiments.benchmarks.suite_benchmark --scores a.csv runs/suite # no training
 
 Other words are settings, as `python -m purerl.run suite --help` lists them. All seeds of a task
 are vmapped in one process, as many processes at once as the machine takes. The same command goes
@@ -18,9 +18,9 @@ import itertools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from envs.suite.tasks import TASKS
-from experiments.benchmarks import suite_pictures, suite_scores
 from purerl.core.errors import INTERRUPTED, SUCCESS, USAGE, UserError, unknown_name
+from purerl.envs.suite.tasks import TASKS
+from purerl.experiments.benchmarks import suite_pictures, suite_scores
 from purerl.report.run_reader import read
 from purerl.runs.command_errors import leave
 from purerl.runs.files import runs_in
@@ -30,7 +30,7 @@ from purerl.sweep import main as sweep
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code, which is that of the sweep."""
     parser = argparse.ArgumentParser(
-        prog="python -m experiments.benchmarks.suite_benchmark",
+        prog="python -m purerl.experiments.benchmarks.suite_benchmark",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         exit_on_error=False,  # it would print all options

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.benchmarks.suite_scores import (
+from purerl.experiments.benchmarks.suite_scores import (
     BEST,
     LEVELS,
     Seed,

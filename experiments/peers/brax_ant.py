@@ -6,8 +6,8 @@ Expected: return 3,300 after 10 M steps (interquartile mean of 8 seeds; brax's o
 published settings: 3,250 after 31 M). `docs/measurements/peers.md` has each seed.
 """
 
-from experiments.peers import brax_env
 from purerl import Config, Evaluation, Experiment, networks
+from purerl.experiments.peers import brax_env
 
 experiment = Experiment(
     build_env=brax_env.build,

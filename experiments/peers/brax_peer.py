@@ -1,8 +1,8 @@
 """brax's PPO beside ours, on brax's own bodies with brax's published settings: steps per second.
 
     python -m pip install -c constraints.txt -e '.[peers]'
-    python -m experiments.peers.brax_peer ant humanoid --json rates.json
-    python -m experiments.peers.brax_peer ant --trainers brax    # with XLA's own choice of kernels
+    python -m purerl.experiments.peers.brax_peer ant humanoid --json rates.json
+    python -m purerl.experiments.peers.brax_peer ant --trainers brax # XLA chooses kernels
 
 Same observation, reward, end and start (brax's code, `experiments/peers/brax_env.py`), widths of
 networks, environments, samples, minibatches and epochs; no evaluation and no checkpoint. Three
@@ -34,15 +34,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from experiments.benchmarks.benchmark import Part, measure
-from experiments.benchmarks.output import output_file
-from experiments.peers import brax_env
-from experiments.peers.sb3 import Ours
 from purerl import exact, networks
 from purerl.core.records import Array, PyTree
 from purerl.devices import compilation
 from purerl.devices.programs import abstract_state, compile_programs
 from purerl.devices.shards import Shards
+from purerl.experiments.benchmarks.benchmark import Part, measure
+from purerl.experiments.benchmarks.output import output_file
+from purerl.experiments.peers import brax_env
+from purerl.experiments.peers.sb3 import Ours
 from purerl.ppo.config import Config, Evaluation
 from purerl.runs import build_experiment
 from purerl.runs.command_errors import leave

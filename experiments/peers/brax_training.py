@@ -1,8 +1,8 @@
 """brax's PPO with its published settings, and its returns beside those of our own settings.
 
-    python -m experiments.peers.brax_training train ant --seeds 0 1 2 3 4 --json brax_ant.json
+    python -m purerl.experiments.peers.brax_training train ant --seeds 0 1 2 --json brax_ant.json
     python -m purerl.run experiments/peers/brax_ant.py --num-seeds 8 --seed 20
-    python -m experiments.peers.brax_training table ant brax_ant.json runs/brax_ant
+    python -m purerl.experiments.peers.brax_training table ant brax_ant.json runs/brax_ant
 
 brax's settings are those of `experiments/peers/brax_peer.py`; it keeps XLA's own choice of kernels.
 The first seed is from cold: an empty compilation cache (of its own folder, unless `--cache` names
@@ -27,10 +27,10 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from experiments.benchmarks.output import output_file
-from experiments.benchmarks.suite_scores import METRIC, evaluations
-from experiments.peers.brax_peer import BODIES, Published, resize, train_brax
 from purerl.core.errors import UserError
+from purerl.experiments.benchmarks.output import output_file
+from purerl.experiments.benchmarks.suite_scores import METRIC, evaluations
+from purerl.experiments.peers.brax_peer import BODIES, Published, resize, train_brax
 from purerl.report import bootstrap, run_reader
 from purerl.runs.command_errors import leave
 

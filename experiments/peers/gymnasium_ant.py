@@ -1,10 +1,10 @@
-"""Gymnasium's Ant-v5, to compare with other trainers (`python -m experiments.peers.sb3`).
+"""Gymnasium's Ant-v5, to compare with other trainers (`python -m purerl.experiments.peers.sb3`).
 
 python -m pip install -c constraints.txt -e '.[peers]'
 python -m purerl.run experiments/peers/gymnasium_ant.py
 """
 
-from envs import gymnasium_ant
+from purerl.envs import gymnasium_ant
 from purerl.ppo import networks
 from purerl.ppo.config import Config, Evaluation
 from purerl.runs.experiment import Experiment

@@ -1,6 +1,6 @@
 """Trains a MuJoCo Playground task as Playground does: brax's PPO with its published settings.
 
-    python -m experiments.peers.playground_training CartpoleSwingup --seed 0 --steps 5000000
+    python -m purerl.experiments.peers.playground_training CartpoleSwingup --seed 0 --steps 5000000
 
 A line of JSON for each evaluation: steps, return, its deviation over episodes, seconds since the
 start. brax makes whole rounds of updates, so it may make more steps than are asked for. Needs brax
@@ -16,7 +16,7 @@ from brax.training.agents.ppo import networks, train
 from mujoco_playground import registry, wrapper
 from mujoco_playground.config import dm_control_suite_params
 
-from experiments.peers.brax_peer import lend_removed_function
+from purerl.experiments.peers.brax_peer import lend_removed_function
 
 
 def main() -> None:

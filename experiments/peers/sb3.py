@@ -1,7 +1,7 @@
 """Other trainers beside this one, on the same body: steps per second of whole training.
 
     python -m pip install -c constraints.txt -e '.[peers]'
-    python -m experiments.peers.sb3 --json docs/measurements/peers_sb3.json
+    python -m purerl.experiments.peers.sb3 --json docs/measurements/peers_sb3.json
 
 Both train Gymnasium's Ant-v5 on the CPU: stable-baselines3's PPO steps Gymnasium's environment,
 purerl `envs/gymnasium_ant.py`, which a test compares with it. Three settings:
@@ -28,9 +28,9 @@ from typing import Any, NamedTuple
 
 import jax
 
-from experiments.benchmarks.benchmark import Part, Timing, measure
-from experiments.benchmarks.output import output_file
-from experiments.peers.gymnasium_ant import experiment
+from purerl.experiments.benchmarks.benchmark import Part, Timing, measure
+from purerl.experiments.benchmarks.output import output_file
+from purerl.experiments.peers.gymnasium_ant import experiment
 from purerl.ppo import algorithm
 from purerl.ppo.config import Config
 from purerl.ppo.networks import MlpOptions

@@ -52,6 +52,7 @@ class Experiment:
 
 
 BUILDERS = ("build_env", "build_network")
+OURS = (Path(__file__).parents[1] / "experiments").resolve()
 
 
 class Source(NamedTuple):
@@ -67,9 +68,9 @@ class Source(NamedTuple):
 
 
 def _folders() -> list[Path]:
-    """Returns where named experiments are looked for: here, then beside the library."""
-    places = [Path.cwd() / "experiments", Path(__file__).parents[2] / "experiments"]
-    return [place for place in dict.fromkeys(places) if place.is_dir()]
+    """Returns where named experiments are looked for: here, then the library's own."""
+    places = dict.fromkeys([(Path.cwd() / "experiments").resolve(), OURS])
+    return [place for place in places if place.is_dir()]
 
 
 def available() -> dict[str, Path]:
@@ -129,7 +130,7 @@ def find_source(name: str) -> Source:
         return load(Path(str(spec.origin)))
     if Path(name).exists() or Path(f"{name}.py").is_file():
         raise UserError(f"{name} is no Python file; an experiment is one, as {Path(name).stem}.py.")
-    places = f" in {' or '.join(map(str, _folders())) or 'sight'}"
+    places = f" in {' or '.join(map(str, _folders()))}"
     raise UserError(unknown_name("experiment", name, named, places))
 
 
@@ -153,8 +154,7 @@ def load(
     place = origin or path
     module_name = _module_name(path)
     spec = importlib.util.spec_from_file_location(module_name, path)
-    assert spec is not None  # it is a .py file
-    module = importlib.util.module_from_spec(spec)
+    module = importlib.util.module_from_spec(spec)  # type: ignore[arg-type]  # it is a .py file
     sys.modules[module_name] = module  # dataclasses and help texts look their module up
     module.__file__ = str(place)
     with _mistakes(str(path), place):
@@ -166,8 +166,7 @@ def load(
         )
     with _mistakes(str(path), place):
         exec(compile(text, str(path), "exec", dont_inherit=True), module.__dict__)
-    found = getattr(module, "experiment", None)
-    if not isinstance(found, Experiment):
+    if not isinstance(found := getattr(module, "experiment", None), Experiment):
         raise UserError(f"{path} defines no `experiment = Experiment(...)` (it is {found!r}).")
     for field in ("env", "network", "ppo", "evaluation"):
         if not _has_settings(value := getattr(found, field)):
@@ -180,6 +179,8 @@ def load(
 
 def _module_name(path: Path) -> str:
     """Returns a file's name as a module: in a package its own, so that its source counts there."""
+    if OURS in path.parents:
+        return ".".join(("purerl.experiments", *path.with_suffix("").relative_to(OURS).parts))
     root = path.parent
     while (root / "__init__.py").exists():
         root = root.parent
@@ -200,8 +201,7 @@ def _mistakes(file: str, place: Path) -> Iterator[None]:
     except SyntaxError as error:
         raise UserError(f"{error.filename}, line {error.lineno}: {error.msg}.") from error
     except Exception as error:
-        frames = traceback.extract_tb(error.__traceback__)
-        lines = [frame.lineno for frame in frames if frame.filename == file]
+        lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == file]
         where = f", line {lines[-1]}" if lines else ""
         missing = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
         beside, hint = place.parent / missing.partition(".")[0], ""

@@ -14,6 +14,8 @@ from pathlib import Path
 PACKAGE = Path(__file__).parent.parent
 # Rooms that only start runs, or look at what one has written.
 AFTERWARDS = {"report", "tune"}
+# Environments and experiments count where they are imported, as a person's own do.
+IMPORTED = {"envs", "experiments", "assets"}
 
 
 def source_hashes(builders: Iterable[Callable], package: Path = PACKAGE) -> dict[str, str]:
@@ -46,7 +48,7 @@ def package_files(package: Path) -> dict[str, Path]:
     found = {}
     for file in package.rglob("*.py"):
         room, *inside = file.relative_to(package).with_suffix("").parts
-        if room not in AFTERWARDS if inside else room == "__init__":
+        if room not in AFTERWARDS | IMPORTED if inside else room == "__init__":
             found[".".join((package.name, room, *inside)).removesuffix(".__init__")] = file
     return found
 
@@ -62,15 +64,16 @@ def imported_files(names: Iterable[str]) -> dict[str, Path]:
     """Returns module name -> file, of the modules `names` and all they import.
 
     Other packages' files count unless they are installed: those have a version. This package's do
-    not: `package_files` lists them.
+    not, but for those in IMPORTED: `package_files` lists them.
     """
     todo = list(names)
-    ours = {name.partition(".")[0]: True for name in todo} | {PACKAGE.name: False, "": False}
+    ours = {_package(name): True for name in todo} | {PACKAGE.name: False, "": False}
+    ours |= {f"{PACKAGE.name}.{room}": True for room in IMPORTED}
     installed = _installed_folders()
     found: dict[str, Path] = {}
     while todo:
         name = todo.pop()
-        package = name.partition(".")[0]
+        package = _package(name)
         if package not in ours:
             ours[package] = not _is_within(package, installed)
         file = module_file(name) if ours[package] and name not in found else None
@@ -79,6 +82,13 @@ def imported_files(names: Iterable[str]) -> dict[str, Path]:
             # Python runs a package's __init__.py first.
             todo += [*_imports(name, file), name.rpartition(".")[0]]
     return found
+
+
+def _package(module: str) -> str:
+    """Returns the package that a module counts with; a room in IMPORTED is one of its own."""
+    first, _, inside = module.partition(".")
+    room = inside.partition(".")[0]
+    return f"{first}.{room}" if first == PACKAGE.name and room in IMPORTED else first
 
 
 def _is_within(package: str, folders: set[Path]) -> bool:

@@ -15,8 +15,8 @@ import pytest
 from dm_env import test_utils
 
 import purerl
-from envs import cartpole_swingup, run
 from purerl import adapters
+from purerl.envs import cartpole_swingup, run
 from tests.golden import privileged
 from tests.test_readme import PAGES, blocks
 
@@ -184,7 +184,7 @@ DRAW = """
 import os
 from purerl.report.opengl import choose_gl
 os.environ["MUJOCO_GL"] = choose_gl()
-from envs import cartpole_swingup
+from purerl.envs import cartpole_swingup
 from purerl import adapters
 env = adapters.gymnasium_env(cartpole_swingup.build(), render_mode="rgb_array")
 pictures = []
@@ -213,7 +213,7 @@ from purerl.report.opengl import choose_gl
 os.environ["MUJOCO_GL"] = choose_gl()
 import jax
 import numpy as np
-from envs import run
+from purerl.envs import run
 from purerl import adapters
 from purerl.physics.drawing import default_camera
 env = run.build(run.Options(arena="gaps"), "c")

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from mujoco.batch import Batch
 
-from envs import arenas, compose as compose_module
-from envs.arenas import Floor, GapsCorridor, course_changes, draw_course
-from envs.bodies import ANT, RODENT
-from envs.compose import PREFIX, compose
+from purerl.envs import arenas, compose as compose_module
+from purerl.envs.arenas import Floor, GapsCorridor, course_changes, draw_course
+from purerl.envs.bodies import ANT, RODENT
+from purerl.envs.compose import PREFIX, compose
 from purerl.physics.interface import Physics
 from purerl.physics.lookup import find, names
 from tests import quick

@@ -12,9 +12,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from envs import arenas, cartpole_swingup, run
-from envs.bodies import ANT, RODENT
-from experiments.peers import brax_env
+from purerl.envs import arenas, cartpole_swingup, run
+from purerl.envs.bodies import ANT, RODENT
+from purerl.experiments.peers import brax_env
 from purerl.physics.interface import PhysicsState
 from purerl.runs.check_env import check_env
 from tests import quick

@@ -10,9 +10,9 @@ from dm_control.rl import control
 from dm_control.suite.utils import randomizers
 from dm_control.utils import rewards
 
-from envs.suite import base, hopper, tasks
-from envs.suite.rewards import SIGMOIDS, tolerance
 from purerl import run
+from purerl.envs.suite import base, hopper, tasks
+from purerl.envs.suite.rewards import SIGMOIDS, tolerance
 from purerl.runs.check_env import check_env
 from tests import quick
 

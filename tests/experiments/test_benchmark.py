@@ -11,8 +11,8 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.benchmarks import benchmark, scaling, start_up
 from purerl.core.errors import UserError
+from purerl.experiments.benchmarks import benchmark, scaling, start_up
 from purerl.runs.experiment import find
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from experiments.benchmarks.gaps_crossed import report
+from purerl.experiments.benchmarks.gaps_crossed import report
 
 
 def test_a_row_has_shares_quantiles_and_speed():

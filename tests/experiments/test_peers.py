@@ -11,8 +11,8 @@ pytest.importorskip("gymnasium", reason="needs the extra peers")
 
 import gymnasium  # noqa: E402
 
-from envs import gymnasium_ant  # noqa: E402
 from purerl.core.errors import UserError  # noqa: E402
+from purerl.envs import gymnasium_ant  # noqa: E402
 from purerl.runs.check_env import check_env  # noqa: E402
 from tests import quick  # noqa: E402
 
@@ -91,7 +91,7 @@ def test_starts_are_spread_as_gymnasiums():
 def test_both_trainers_learn_with_equal_sizes():
     """Counts stable-baselines3's gradient steps and parameters, and ours."""
     pytest.importorskip("stable_baselines3", reason="needs the extra peers")
-    from experiments.peers import sb3 as peers
+    from purerl.experiments.peers import sb3 as peers
 
     sizes = peers.Sizes((16, 8), "swish", samples=512, minibatch=64, epochs=2)
     part = peers.sb3(sizes, 2, processes=False, threads=1)
@@ -111,7 +111,7 @@ def test_both_trainers_learn_with_equal_sizes():
 def test_braxs_environment_keeps_to_the_protocol_and_steps_as_braxs():
     """Its states through our record and back are the states that brax steps through itself."""
     pytest.importorskip("brax", reason="needs the extra peers")
-    from experiments.peers import brax_env
+    from purerl.experiments.peers import brax_env
 
     env = brax_env.build(brax_env.Options(backend="positional"))  # the quickest to compile
     check_env(env)
@@ -129,7 +129,7 @@ def test_braxs_environment_keeps_to_the_protocol_and_steps_as_braxs():
 @pytest.mark.parametrize("body", ["ant", "humanoid", "halfcheetah"])
 def test_braxs_settings_make_the_same_update(body):
     """As many samples, of as many environments, in minibatches of the same size."""
-    from experiments.peers import brax_peer
+    from purerl.experiments.peers import brax_peer
 
     sizes = brax_peer.BODIES[body]
     config = brax_peer.our_experiment(body, "mjx", sizes, 10**8).ppo
@@ -142,7 +142,7 @@ def test_braxs_settings_make_the_same_update(body):
 @pytest.mark.parametrize("body", ["ant", "humanoid"])
 def test_braxs_body_moves_on_our_physics_as_on_braxs(body):
     pytest.importorskip("brax", reason="needs the extra peers")
-    from experiments.peers import brax_env
+    from purerl.experiments.peers import brax_env
 
     ours, theirs = (
         brax_env.build(brax_env.Options(body, physics), "jax") for physics in ("purerl", "mjx")
@@ -170,14 +170,14 @@ def test_braxs_body_moves_on_our_physics_as_on_braxs(body):
 
 def test_a_training_has_braxs_number_of_updates():
     """Brax rounds up to the same number of updates between any two evaluations."""
-    from experiments.peers import brax_peer, brax_training
+    from purerl.experiments.peers import brax_peer, brax_training
 
     task = brax_training.make_task("ant", brax_peer.BODIES["ant"], 31_000_000, evaluations=6)
     assert (task.stretches, task.updates, task.steps) == (5, 19, 31_129_600)
 
 
 def test_the_difference_of_returns_has_an_interval_from_five_seeds_on():
-    from experiments.peers import brax_training
+    from purerl.experiments.peers import brax_training
 
     ours, theirs = np.arange(5.0) + 100, np.arange(5.0)
     assert brax_training.difference(ours, theirs).startswith("100 [")
@@ -186,7 +186,7 @@ def test_the_difference_of_returns_has_an_interval_from_five_seeds_on():
 
 def test_our_runs_stand_beside_braxs(tmp_path, capsys):
     """Runs of another body are left out; one without an evaluation is told."""
-    from experiments.peers import brax_training
+    from purerl.experiments.peers import brax_training
 
     run = brax_training.Run("brax", "ant", 0, False, [0, 10], [1.0, 30.0], [0.0, 100.0], [])
     theirs = [run._replace(seed=i, returns=[0.0, 100.0 + i])._asdict() for i in range(5)]

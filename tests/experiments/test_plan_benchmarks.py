@@ -4,8 +4,8 @@ import csv
 
 import pytest
 
-from experiments.benchmarks import plan_speed, plan_suite
 from purerl.core.errors import UserError
+from purerl.experiments.benchmarks import plan_speed, plan_suite
 from purerl.tune.plan.settings import Settings
 
 TASK = "cartpole-swingup"

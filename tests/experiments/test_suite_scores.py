@@ -5,10 +5,10 @@ import argparse
 import numpy as np
 import pytest
 
-from envs.suite.tasks import TASKS
-from experiments.benchmarks import suite_benchmark, suite_pictures, suite_scores
-from experiments.benchmarks.suite_scores import Seed
 from purerl.core.errors import INTERRUPTED, SUCCESS, USAGE, UserError
+from purerl.envs.suite.tasks import TASKS
+from purerl.experiments.benchmarks import suite_benchmark, suite_pictures, suite_scores
+from purerl.experiments.benchmarks.suite_scores import Seed
 
 
 def seed(number, *returns, task="cheetah-run", status="done"):

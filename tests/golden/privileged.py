@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 
-from envs import cartpole_swingup
 from purerl import Array, Config, Evaluation, Experiment, State, networks
+from purerl.envs import cartpole_swingup
 
 
 @dataclass(frozen=True)

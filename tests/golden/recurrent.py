@@ -1,7 +1,7 @@
 """A cart-pole and a network with memory."""
 
-from envs import cartpole_swingup
 from purerl import Config, Evaluation, Experiment, networks
+from purerl.envs import cartpole_swingup
 
 experiment = Experiment(
     build_env=cartpole_swingup.build,

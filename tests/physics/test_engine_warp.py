@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from envs import run
+from purerl.envs import run
 from purerl.physics.interface import (
     READINGS,
     Physics,

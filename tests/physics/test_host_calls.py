@@ -171,7 +171,7 @@ def test_another_process_finds_the_program_compiled(tmp_path):
 
 LEAVE = """
 import jax, jax.numpy as jnp
-from envs import cartpole_swingup
+from purerl.envs import cartpole_swingup
 env = cartpole_swingup.build(cartpole_swingup.Options(), "c")
 state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 64))
 @jax.jit

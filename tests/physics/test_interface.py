@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from dm_control import suite
 
-from envs import run
 from purerl import exact
+from purerl.envs import run
 from purerl.exact.traces import equations
 from purerl.physics import lookup
 from purerl.physics.interface import CHANGEABLE_FIELDS, READINGS, Physics, choose_engine

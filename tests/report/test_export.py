@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import purerl
-from experiments import custom_network
 from purerl import __main__ as commands
 from purerl.core.errors import USAGE
+from purerl.experiments import custom_network
 from purerl.report import episode_arrays, numpy_policy, policy_npz
 from purerl.report.policy_file import Recorded, control_range, origin, record_episodes
 from tests.golden import privileged, recurrent

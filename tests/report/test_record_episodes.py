@@ -20,7 +20,7 @@ from tests.runs.test_run import TOY
 
 TRAIN = """
 import dataclasses
-from experiments.cartpole_swingup import experiment
+from purerl.experiments.cartpole_swingup import experiment
 from purerl.ppo.config import Config
 from purerl.ppo.networks import MlpOptions, RecurrentOptions, mlp, recurrent
 

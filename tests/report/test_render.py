@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from envs import cartpole_swingup
 from purerl import render, run
 from purerl.core.errors import FAILURE, USAGE, RunError
 from purerl.core.keys import per_environment
+from purerl.envs import cartpole_swingup
 from purerl.physics.drawing import default_camera, root_body
 from purerl.report import episode_pictures, opengl, renderer as drawing, video
 from purerl.runs.policy import Policy

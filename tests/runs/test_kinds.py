@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import pytest
 
-from experiments import cartpole_swingup
 from purerl.core.errors import UserError
+from purerl.experiments import cartpole_swingup
 from purerl.runs import build_experiment
 from purerl.runs.kinds import wrong_value
 

@@ -17,8 +17,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import mujoco
 
-from envs import cartpole_swingup
-from experiments.cartpole_swingup import experiment
+from purerl.envs import cartpole_swingup
+from purerl.experiments.cartpole_swingup import experiment
 from my_habits import HABIT
 from purerl.ppo.config import Config
 from purerl.ppo.networks import MlpOptions

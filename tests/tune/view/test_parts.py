@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from envs import run
 from purerl import UserError
+from purerl.envs import run
 from purerl.report.episode_pictures import Picture
 from purerl.runs.command_line import from_command_line
 from purerl.runs.experiment import find_source
