@@ -52,11 +52,12 @@ _NAMES = {
     "tune.plan.planner": "planner",
     "ppo.config": "Config Evaluation",
     "ppo.networks": "networks",
-    "runs.check_env": "check_env",
-    "runs.experiment": "Experiment find",
+    "checks.check_env": "check_env",
+    "experiment.definition": "Experiment",
+    "experiment.loading": "find",
     "runs.loaded_run": "Run load",
     "runs.policy": "Policy",
-    "runs.training": "train",
+    "training.train": "train",
 }
 HOMES = {name: f"purerl.{home}" for home, names in _NAMES.items() for name in names.split()}
 __all__ = sorted(HOMES)

@@ -1,5 +1,6 @@
 # The names of `__init__.py`, for editors and type checkers; a test compares the two.
 from purerl import adapters as adapters, exact as exact
+from purerl.checks.check_env import check_env as check_env
 from purerl.core.env import Env as Env, EnvError as EnvError, State as State
 from purerl.core.errors import (
     RunError as RunError,
@@ -13,6 +14,8 @@ from purerl.core.records import (
     PolicyOutput as PolicyOutput,
     PyTree as PyTree,
 )
+from purerl.experiment.definition import Experiment as Experiment
+from purerl.experiment.loading import find as find
 from purerl.physics import lookup as lookup
 from purerl.physics.interface import (
     Physics as Physics,
@@ -23,11 +26,9 @@ from purerl.physics.interface import (
 )
 from purerl.ppo import networks as networks
 from purerl.ppo.config import Config as Config, Evaluation as Evaluation
-from purerl.runs.check_env import check_env as check_env
-from purerl.runs.experiment import Experiment as Experiment, find as find
 from purerl.runs.loaded_run import Run as Run, load as load
 from purerl.runs.policy import Policy as Policy
-from purerl.runs.training import train as train
+from purerl.training.train import train as train
 from purerl.tune.plan import planner as planner
 
 __version__: str

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from purerl.core.errors import USAGE, UserError, unknown_name
-from purerl.runs.command_errors import leave, tell
-from purerl.runs.experiment import summary
-from purerl.runs.output import show
+from purerl.experiment.loading import summary
+from purerl.machine.command_errors import leave, tell
+from purerl.machine.output import show
 
 COMMANDS = (
     "new", "check", "run", "evaluate", "render", "view", "record", "export", "compare", "report",

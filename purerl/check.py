@@ -11,12 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from purerl.core.errors import FAILURE, USAGE, RunError, UserError
-from purerl.runs import experiment, options, output
-from purerl.runs.command_errors import leave, tell
+from purerl.experiment import loading, options
+from purerl.machine import output
+from purerl.machine.command_errors import leave, tell
 
 
 @dataclass(frozen=True)
-class Options(options.Options):
+class CheckOptions(options.RunOptions):
     """What `run` takes, and what is left out here."""
 
     speed: bool = True
@@ -37,24 +38,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _command(arguments: Sequence[str]) -> int:
     """Prints each finding when it is found."""
+    from purerl.checks.user_code import program_errors
     from purerl.devices import compilation
-    from purerl.runs import training
-    from purerl.runs.command_line import from_command_line
-    from purerl.runs.examine import examine
-    from purerl.runs.user_code import running
+    from purerl.experiment.command_line import from_command_line
+    from purerl.experiment.examine import examine
+    from purerl.training import train
 
-    training.set_xla_flags_in_time()
+    train.set_xla_flags_in_time()
     if not arguments or arguments[0].startswith("-"):
         raise UserError(
             "The first word must be the experiment: python -m purerl.check EXPERIMENT "
             "[--option value ...]"
         )
-    source = experiment.find_source(arguments[0])
+    source = loading.find_source(arguments[0])
     prog = f"python -m purerl.check {arguments[0]}"
-    chosen, given = from_command_line(source, arguments[1:], prog, base=Options)
+    chosen, given = from_command_line(source, arguments[1:], prog, base=CheckOptions)
     compilation.set_up_jax(given.cache)
     levels: list[str] = []
-    with running():
+    with program_errors():
         for finding in examine(chosen, given.speed):
             output.show(str(finding))
             levels.append(finding.level)

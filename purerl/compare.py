@@ -15,13 +15,13 @@ from typing import Annotated
 import tyro
 
 from purerl.core.errors import FAILURE, SUCCESS, UserError
-from purerl.runs.command_errors import leave
-from purerl.runs.command_line import carry_out
-from purerl.runs.output import show
+from purerl.experiment.command_line import carry_out
+from purerl.machine.command_errors import leave
+from purerl.machine.output import show
 
 
 @dataclass(frozen=True)
-class Options:
+class CompareOptions:
     """Compares runs: bit by bit where configuration and seed agree, else by statistics over seeds.
 
     Ten seeds against ten others: python -m purerl.compare 'runs/ant_run/a*' 'runs/ant_run/b*'
@@ -41,10 +41,10 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return carry_out(Options, command, "python -m purerl.compare", arguments)
+    return carry_out(CompareOptions, command, "python -m purerl.compare", arguments)
 
 
-def command(options: Options) -> int:
+def command(options: CompareOptions) -> int:
     """Compares, prints and writes what was asked for; returns the exit code."""
     from purerl.report import comparison
 

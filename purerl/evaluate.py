@@ -9,15 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from purerl.runs.command_errors import leave
-from purerl.runs.command_line import carry_out
-from purerl.runs.files import check_writable, write_answer
-from purerl.runs.options import PlayOptions
-from purerl.runs.output import show
+from purerl.experiment.command_line import carry_out
+from purerl.experiment.options import PlayOptions
+from purerl.machine.command_errors import leave
+from purerl.machine.files import check_writable, write_answer
+from purerl.machine.output import show
 
 
 @dataclass(frozen=True)
-class Options(PlayOptions):
+class EvaluateOptions(PlayOptions):
     """Evaluates a run's policy on whole episodes in fresh environments."""
 
     episodes: int = 100
@@ -30,10 +30,10 @@ class Options(PlayOptions):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return carry_out(Options, command, "python -m purerl.evaluate", arguments)
+    return carry_out(EvaluateOptions, command, "python -m purerl.evaluate", arguments)
 
 
-def command(options: Options) -> None:
+def command(options: EvaluateOptions) -> None:
     """Evaluates, prints the figures, and writes the file that was asked for."""
     from purerl.runs.loaded_run import load
 

@@ -17,17 +17,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 from purerl.core.errors import UserError
-from purerl.runs.command_errors import leave
-from purerl.runs.command_line import carry_out
-from purerl.runs.files import check_writable
-from purerl.runs.options import PlayOptions
-from purerl.runs.output import show
+from purerl.experiment.command_line import carry_out
+from purerl.experiment.options import PlayOptions
+from purerl.machine.command_errors import leave
+from purerl.machine.files import check_writable
+from purerl.machine.output import show
 
 NEEDS = {"npz": (), "jax": ("flatbuffers",), "onnx": ("onnx", "onnxruntime")}  # format: packages
 
 
 @dataclass(frozen=True)
-class Options(PlayOptions):  # noqa: D101 (--help prints the page above)
+class ExportOptions(PlayOptions):  # noqa: D101 (--help prints the page above)
     __doc__ = __doc__
 
     format: Literal["npz", "jax", "onnx"] = "npz"
@@ -38,10 +38,10 @@ class Options(PlayOptions):  # noqa: D101 (--help prints the page above)
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return carry_out(Options, command, "python -m purerl.export", arguments)
+    return carry_out(ExportOptions, command, "python -m purerl.export", arguments)
 
 
-def command(options: Options) -> None:
+def command(options: ExportOptions) -> None:
     """Writes the file and tells how near it comes."""
     from purerl.report.policy_file import record_episodes
     from purerl.runs.loaded_run import load

@@ -15,13 +15,13 @@ from typing import Annotated
 
 import tyro
 
-from purerl.runs.command_errors import leave
-from purerl.runs.command_line import carry_out
-from purerl.runs.output import show
+from purerl.experiment.command_line import carry_out
+from purerl.machine.command_errors import leave
+from purerl.machine.output import show
 
 
 @dataclass(frozen=True)
-class Options:
+class NewOptions:
     """Writes a project of your own that trains at once."""
 
     name: Annotated[Path, tyro.conf.Positional]
@@ -30,12 +30,12 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return carry_out(Options, command, "python -m purerl.new", arguments)
+    return carry_out(NewOptions, command, "python -m purerl.new", arguments)
 
 
-def command(options: Options) -> None:
+def command(options: NewOptions) -> None:
     """Writes the files, and says how to go on."""
-    from purerl.runs.new_project import write_project
+    from purerl.experiment.new_project import write_project
 
     show(*map(str, write_project(options.name)), "", f"cd {shlex.quote(str(options.name))}")
     show("python -m purerl.check experiment.py    # what can be checked before training")

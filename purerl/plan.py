@@ -14,26 +14,27 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
-from purerl.runs import output
-from purerl.runs.command_errors import leave
+from purerl.machine import output
+from purerl.machine.command_errors import leave
 
 PROG = "python -m purerl.plan"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    from purerl.tune.plan.problem import Options
+    from purerl.tune.plan.problem import PlanCommandOptions
     from purerl.tune.subject import carry_out_on_subject
 
-    return carry_out_on_subject(command, Options, __doc__, PROG, arguments)
+    return carry_out_on_subject(command, PlanCommandOptions, __doc__, PROG, arguments)
 
 
 def command(words: Sequence[str]) -> None:
     """Plans, prints the figures, and writes the files that were asked for."""
     from purerl.devices.compilation import set_up_jax
+    from purerl.machine.files import write_answer
+    from purerl.machine.signals import stop_signals
     from purerl.report.opengl import choose_gl
-    from purerl.runs.files import write_answer
-    from purerl.runs.training import set_xla_flags_in_time, stop_signals
+    from purerl.training.train import set_xla_flags_in_time
     from purerl.tune.plan import figures
     from purerl.tune.plan.play import play
     from purerl.tune.plan.problem import read

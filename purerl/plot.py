@@ -12,13 +12,13 @@ from typing import Annotated
 import tyro
 
 from purerl.core.errors import UserError
-from purerl.runs.command_errors import leave
-from purerl.runs.command_line import carry_out
-from purerl.runs.output import show
+from purerl.experiment.command_line import carry_out
+from purerl.machine.command_errors import leave
+from purerl.machine.output import show
 
 
 @dataclass(frozen=True)
-class Options:
+class PlotOptions:
     """Plots a metric of runs in the terminal, and as a PNG."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
@@ -31,10 +31,10 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return carry_out(Options, command, "python -m purerl.plot", arguments)
+    return carry_out(PlotOptions, command, "python -m purerl.plot", arguments)
 
 
-def command(options: Options) -> None:
+def command(options: PlotOptions) -> None:
     """Prints the curve, and writes the picture that was asked for."""
     from purerl.report import comparison
     from purerl.report.run_reader import find_runs, read

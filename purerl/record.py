@@ -27,15 +27,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from purerl.core.errors import UserError
-from purerl.runs.command_errors import leave
-from purerl.runs.command_line import carry_out
-from purerl.runs.files import check_writable, write_arrays
-from purerl.runs.options import PlayOptions
-from purerl.runs.output import show
+from purerl.experiment.command_line import carry_out
+from purerl.experiment.options import PlayOptions
+from purerl.machine.command_errors import leave
+from purerl.machine.files import check_writable, write_arrays
+from purerl.machine.output import show
 
 
 @dataclass(frozen=True)
-class Options(PlayOptions):  # noqa: D101 (--help prints the page above)
+class RecordOptions(PlayOptions):  # noqa: D101 (--help prints the page above)
     __doc__ = __doc__
 
     out: Path = Path("episodes.npz")
@@ -46,10 +46,10 @@ class Options(PlayOptions):  # noqa: D101 (--help prints the page above)
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return carry_out(Options, command, "python -m purerl.record", arguments)
+    return carry_out(RecordOptions, command, "python -m purerl.record", arguments)
 
 
-def command(options: Options) -> None:
+def command(options: RecordOptions) -> None:
     """Writes the file and tells what is in it."""
     from purerl.report.episode_arrays import record
     from purerl.runs.loaded_run import load

@@ -9,14 +9,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from purerl.core.errors import UserError
-from purerl.runs.command_errors import leave
-from purerl.runs.command_line import carry_out
-from purerl.runs.options import PlayOptions
-from purerl.runs.output import show
+from purerl.experiment.command_line import carry_out
+from purerl.experiment.options import PlayOptions
+from purerl.machine.command_errors import leave
+from purerl.machine.output import show
 
 
 @dataclass(frozen=True)
-class Options(PlayOptions):
+class RenderOptions(PlayOptions):
     """Makes a video (mp4) and a contact sheet (PNG) of a run's policy, in RUN/videos/."""
 
     camera: str = ""
@@ -31,15 +31,15 @@ class Options(PlayOptions):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return carry_out(Options, command, "python -m purerl.render", arguments)
+    return carry_out(RenderOptions, command, "python -m purerl.render", arguments)
 
 
-def command(options: Options) -> None:
+def command(options: RenderOptions) -> None:
     """Makes the video, and prints which files it made."""
     show(*make(options))
 
 
-def make(options: Options) -> list[str]:
+def make(options: RenderOptions) -> list[str]:
     """Checks the options and makes the video; returns lines about it, the last ones its files."""
     from purerl.report.opengl import open_gl
 

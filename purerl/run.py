@@ -20,8 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import USAGE, RunError, StoppedError, UserError, one_line
-from purerl.runs import experiment, output
-from purerl.runs.command_errors import leave, tell
+from purerl.experiment import loading
+from purerl.machine import output
+from purerl.machine.command_errors import leave, tell
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -39,43 +40,43 @@ def main(arguments: Sequence[str] | None = None) -> int:
             more = [] if "--resume" in arguments else ["--resume"]
             again = shlex.join(["python", "-m", "purerl.run", *arguments, *more])
             output.warn(f"Go on with: {again}")
-    output.settle(sys.stdout)
+    output.flush_or_drop(sys.stdout)
     return code
 
 
 def _help_page() -> list[str]:
     """Returns the page of `python -m purerl.run --help`, without importing JAX."""
     lines = [*str(__doc__).split("\n"), "Experiments:"]
-    named = experiment.available()
+    named = loading.available()
     width = max(map(len, named), default=0)
-    lines += [f"  {name:{width}}  {experiment.summary(path)}" for name, path in named.items()]
+    lines += [f"  {name:{width}}  {loading.summary(path)}" for name, path in named.items()]
     return lines if named else [*lines, "  none in experiments/"]
 
 
 def _command(arguments: Sequence[str]) -> None:
     """Parses, trains, and with --video shows the policy of the first seed."""
     from purerl import render
+    from purerl.experiment.command_line import from_command_line
     from purerl.report.opengl import choose_gl
-    from purerl.runs import training
-    from purerl.runs.command_line import from_command_line
+    from purerl.training import train
 
-    training.set_xla_flags_in_time()
+    train.set_xla_flags_in_time()
     if arguments[0].startswith("-"):
         raise UserError(
             f"The first word must be the experiment, not {arguments[0]!r}: "
             "python -m purerl.run EXPERIMENT [--option value ...]"
         )
-    source = experiment.find_source(arguments[0])
+    source = loading.find_source(arguments[0])
     prog = f"python -m purerl.run {arguments[0]}"
     chosen, options = from_command_line(source, arguments[1:], prog)
     # Before mujoco is imported, which looks for OpenGL itself.
     video = options.video and _attempt("video", choose_gl)
-    folders = training.train_runs(source, chosen, options, os._exit)
+    folders = train.train_runs(source, chosen, options, os._exit)
     if video:
         from purerl.devices.processes import is_first
 
         if is_first():
-            shown = render.Options(folders[0], trust=True)
+            shown = render.RenderOptions(folders[0], trust=True)
             files: list[str] = []
             if _attempt("video", _show_policy, shown, files):
                 _attempt("video for the loggers", _log_video, options, folders[0], files[-1])

@@ -9,9 +9,9 @@ import sys
 from collections.abc import Sequence
 
 from purerl.core.errors import SUCCESS, USAGE, RunError, UserError
-from purerl.runs import command_line
-from purerl.runs.command_errors import leave, tell
-from purerl.tune.sweep.options import PROG, Options
+from purerl.experiment import command_line
+from purerl.machine.command_errors import leave, tell
+from purerl.tune.sweep.options import PROG, SweepOptions
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -19,7 +19,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if not arguments or {"-h", "--help"} & set(arguments):
         with contextlib.suppress(SystemExit):
-            command_line.parse(Options, ["--help"], PROG)
+            command_line.parse(SweepOptions, ["--help"], PROG)
         return SUCCESS if arguments else USAGE
     try:
         from purerl.tune.sweep.session import execute

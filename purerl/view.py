@@ -14,15 +14,15 @@ from dataclasses import dataclass
 from typing import Literal
 
 from purerl.core.errors import UserError
-from purerl.runs.command_errors import leave
-from purerl.runs.output import show
+from purerl.machine.command_errors import leave
+from purerl.machine.output import show
 from purerl.tune.subject import PlanOptions, carry_out_on_subject, chosen as settings_of, find
 
 PROG = "python -m purerl.view"
 
 
 @dataclass(frozen=True)
-class Options(PlanOptions):
+class ViewOptions(PlanOptions):
     """Who drives the body, and where the page is."""
 
     drive: Literal["", "policy", "planner"] = ""
@@ -37,7 +37,7 @@ class Options(PlanOptions):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return carry_out_on_subject(command, Options, __doc__, PROG, arguments)
+    return carry_out_on_subject(command, ViewOptions, __doc__, PROG, arguments)
 
 
 def has_viser() -> bool:
@@ -48,7 +48,7 @@ def has_viser() -> bool:
 def command(words: Sequence[str]) -> None:
     """Opens the page and plays until Ctrl-C."""
     found = find(words, PROG)
-    chosen, options = settings_of(found, words[1:], f"{PROG} {found.name}", Options)
+    chosen, options = settings_of(found, words[1:], f"{PROG} {found.name}", ViewOptions)
     if not has_viser():  # its help needs no window
         raise UserError(
             "The window needs the package viser: pip install -c constraints.txt -e '.[view]'."

@@ -7,7 +7,7 @@ import shutil
 import tempfile
 
 # Reported cure for hangs of XLA's CPU pool on large vmapped programs (not of those that
-# `purerl/runs/console.py` tells of), and bits that do not depend on the number of cores; it must be
+# `purerl/training/console.py` tells of), and bits that do not depend on the number of cores: to be
 # set before JAX starts.
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
 

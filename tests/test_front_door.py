@@ -149,7 +149,7 @@ def test_there_are_files_to_check():
 
 
 def test_the_list_of_experiments_is_what_a_newcomer_wants_to_see():
-    from purerl.runs.experiment import available, summary
+    from purerl.experiment.loading import available, summary
 
     names = [name for name, path in available().items() if path.parent == ROOT / "experiments"]
     assert names == [

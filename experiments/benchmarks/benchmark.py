@@ -32,16 +32,17 @@ import jax.numpy as jnp
 from purerl import exact
 from purerl.core.parts import WHOLE
 from purerl.core.records import Array, Network, PyTree, TrainState
+from purerl.experiment import command_line, objects
+from purerl.experiment.definition import Experiment
+from purerl.experiment.loading import find_source
 from purerl.experiments.benchmarks import start_up
 from purerl.experiments.benchmarks.output import count, output_file
+from purerl.machine.command_errors import leave
 from purerl.physics.lookup import scale_action
 from purerl.ppo import algorithm, learner
 from purerl.ppo.evaluation import evaluate
 from purerl.ppo.rollout import rollout
-from purerl.runs import build_experiment, command_line
-from purerl.runs.command_errors import leave
-from purerl.runs.console import size
-from purerl.runs.experiment import Experiment, find_source
+from purerl.training.console import size
 
 PARTS = ("physics alone", "rollout", "learner", "update", "evaluation")
 
@@ -98,7 +99,7 @@ def bare_physics(env: Any, config: algorithm.Config, state: TrainState, key: Arr
 
 def make_bench(experiment: Experiment, names: Sequence[str] = PARTS) -> Bench:
     """Compiles the parts of an experiment on its engine."""
-    config, env, network, _ = build_experiment.build(experiment)
+    config, env, network, _ = objects.build(experiment)
     key = jax.random.key(experiment.seed)
     state = jax.jit(partial(algorithm.init, config, env, network))(key)
     seen = None

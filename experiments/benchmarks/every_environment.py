@@ -13,17 +13,18 @@ from functools import partial
 
 import jax
 
+from purerl.checks.check_env import check_env
 from purerl.core.errors import UserError, one_line
 from purerl.envs.suite.tasks import TASKS, Options as SuiteOptions
+from purerl.experiment import objects
+from purerl.experiment.definition import Experiment
+from purerl.experiment.loading import find
+from purerl.experiment.options import Engine
 from purerl.experiments.benchmarks.benchmark import bare_physics, compile_part, measure
 from purerl.experiments.benchmarks.output import count
+from purerl.machine.command_errors import leave
 from purerl.ppo import algorithm
 from purerl.ppo.rollout import rollout
-from purerl.runs import build_experiment
-from purerl.runs.check_env import check_env
-from purerl.runs.command_errors import leave
-from purerl.runs.experiment import Experiment, find
-from purerl.runs.options import Engine
 
 OURS = ("cartpole_swingup", "ant_run", "ant_gaps", "rodent_run", "rodent_gaps")
 ROW = "| {:24} | {:6} | {:8} | {:>13} | {:>9} | {:>5} |"
@@ -48,7 +49,7 @@ def sized(experiment: Experiment, engine: Engine, num_envs: int, length: int) ->
 
 def row(name: str, experiment: Experiment, engine: Engine, rounds: int) -> str:
     """Checks and times one environment on one engine."""
-    config, env, network, _ = build_experiment.build(experiment)
+    config, env, network, _ = objects.build(experiment)
     check_env(env, num_envs=2, num_steps=2)
     key = jax.random.key(experiment.seed)
     state = jax.jit(partial(algorithm.init, config, env, network))(key)

@@ -22,14 +22,13 @@ from purerl.core.errors import UserError
 from purerl.core.keys import Purpose, derive
 from purerl.core.records import Array, Network, Normal, PolicyOutput, TrainState
 from purerl.devices.compilation import set_up_jax
+from purerl.experiment import objects
+from purerl.machine.command_errors import leave
 from purerl.ppo.evaluation import evaluate
-from purerl.runs import build_experiment, restored_run
-from purerl.runs.command_errors import leave
+from purerl.runs import restored_run
 
 
-def gaps_of(
-    setup: build_experiment.Setup, state: TrainState, seed: int, episodes: int
-) -> dict[str, Any]:
+def gaps_of(setup: objects.Setup, state: TrainState, seed: int, episodes: int) -> dict[str, Any]:
     """Evaluates deterministically in `episodes` corridors; the same seed gives the same ones."""
 
     def judge(state: TrainState, key: Array) -> dict[str, Array]:

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from purerl.core.errors import UserError
-from purerl.runs.files import check_writable
+from purerl.machine.files import check_writable
 
 
 def output_file(name: str) -> str:

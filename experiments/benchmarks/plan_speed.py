@@ -22,12 +22,12 @@ import numpy as np
 
 from purerl.devices.compilation import set_up_jax
 from purerl.envs.suite.tasks import TASKS
+from purerl.experiment.loading import available
+from purerl.experiment.objects import build
 from purerl.experiments.benchmarks.output import count
 from purerl.experiments.benchmarks.plan_suite import experiment_of
+from purerl.machine.command_errors import leave
 from purerl.physics import engine_c
-from purerl.runs.build_experiment import build
-from purerl.runs.command_errors import leave
-from purerl.runs.experiment import available
 from purerl.tune.plan import planner
 from purerl.tune.plan.settings import Settings
 

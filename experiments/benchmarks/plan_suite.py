@@ -27,10 +27,11 @@ import numpy as np
 from purerl.core.errors import UserError
 from purerl.devices.compilation import set_up_jax
 from purerl.envs.suite.tasks import TASKS, Options as SuiteOptions
+from purerl.experiment.definition import Experiment
+from purerl.experiment.loading import available, find
+from purerl.experiment.objects import build
 from purerl.experiments.benchmarks.output import count, output_file
-from purerl.runs.build_experiment import build
-from purerl.runs.command_errors import leave
-from purerl.runs.experiment import Experiment, available, find
+from purerl.machine.command_errors import leave
 from purerl.runs.loaded_run import load
 from purerl.tune.plan import episodes, planner
 from purerl.tune.plan.figures import said

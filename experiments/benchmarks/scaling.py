@@ -27,14 +27,15 @@ import jax
 
 from purerl import exact
 from purerl.core.errors import UserError
+from purerl.experiment import objects
+from purerl.experiment.command_line import from_command_line
+from purerl.experiment.definition import Experiment
+from purerl.experiment.loading import find_source
+from purerl.experiment.options import Engine
 from purerl.experiments.benchmarks.benchmark import compile_part, measure
 from purerl.experiments.benchmarks.output import output_file
+from purerl.machine.command_errors import leave
 from purerl.ppo import algorithm
-from purerl.runs import build_experiment
-from purerl.runs.command_errors import leave
-from purerl.runs.command_line import from_command_line
-from purerl.runs.experiment import Experiment, find_source
-from purerl.runs.options import Engine
 
 HERE = sorted(os.sched_getaffinity(0))  # cores that this process may use
 AXES: dict[str, tuple[int, ...]] = {
@@ -121,7 +122,7 @@ def run_on(cores: int, command: list[str]) -> int:
 def seeds_point(experiment: Experiment, engine: Engine, number: int) -> dict[str, Any]:
     """Measures the update of vmapped seeds."""
     chosen = dataclasses.replace(experiment, engine=engine)
-    config, env, network, _ = build_experiment.build(chosen)
+    config, env, network, _ = objects.build(chosen)
     keys = jax.random.split(jax.random.key(chosen.seed), number)
     state = jax.jit(jax.vmap(partial(algorithm.init, config, env, network)))(keys)
     update = jax.vmap(partial(algorithm.update, config, env, network))

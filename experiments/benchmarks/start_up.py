@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from purerl.core.errors import UserError
-from purerl.runs.command_errors import leave
+from purerl.machine.command_errors import leave
 
 LIMIT_S = 900.0
 

@@ -21,9 +21,9 @@ from pathlib import Path
 from purerl.core.errors import INTERRUPTED, SUCCESS, USAGE, UserError, unknown_name
 from purerl.envs.suite.tasks import TASKS
 from purerl.experiments.benchmarks import suite_pictures, suite_scores
+from purerl.machine.command_errors import leave
 from purerl.report.run_reader import read
-from purerl.runs.command_errors import leave
-from purerl.runs.files import runs_in
+from purerl.runs.folder import runs_in
 from purerl.sweep import main as sweep
 
 

@@ -39,14 +39,14 @@ from purerl.core.records import Array, PyTree
 from purerl.devices import compilation
 from purerl.devices.programs import abstract_state, compile_programs
 from purerl.devices.shards import Shards
+from purerl.experiment import objects
+from purerl.experiment.definition import Experiment
 from purerl.experiments.benchmarks.benchmark import Part, measure
 from purerl.experiments.benchmarks.output import output_file
 from purerl.experiments.peers import brax_env
 from purerl.experiments.peers.sb3 import Ours
+from purerl.machine.command_errors import leave
 from purerl.ppo.config import Config, Evaluation
-from purerl.runs import build_experiment
-from purerl.runs.command_errors import leave
-from purerl.runs.experiment import Experiment
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ def physics_alone(env: Any, num_steps: int, start: PyTree, key: Array) -> Array:
 
 def our_parts(chosen: Experiment) -> list[Part]:
     """Compiles the physics alone and our training, side by side, and makes the first update."""
-    config, env, network, _ = build_experiment.build(chosen)
+    config, env, network, _ = objects.build(chosen)
     key = jax.random.key(chosen.seed)
     abstract = abstract_state(config, env, network).env.physics
     bare: Callable = partial(physics_alone, env, config.rollout_length)

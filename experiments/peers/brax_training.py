@@ -31,8 +31,8 @@ from purerl.core.errors import UserError
 from purerl.experiments.benchmarks.output import output_file
 from purerl.experiments.benchmarks.suite_scores import METRIC, evaluations
 from purerl.experiments.peers.brax_peer import BODIES, Published, resize, train_brax
+from purerl.machine.command_errors import leave
 from purerl.report import bootstrap, run_reader
-from purerl.runs.command_errors import leave
 
 NUM_EPISODES = 128
 

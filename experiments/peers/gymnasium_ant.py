@@ -5,9 +5,9 @@ python -m purerl.run experiments/peers/gymnasium_ant.py
 """
 
 from purerl.envs import gymnasium_ant
+from purerl.experiment.definition import Experiment
 from purerl.ppo import networks
 from purerl.ppo.config import Config, Evaluation
-from purerl.runs.experiment import Experiment
 
 experiment = Experiment(
     build_env=gymnasium_ant.build,

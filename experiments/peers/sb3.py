@@ -28,14 +28,14 @@ from typing import Any, NamedTuple
 
 import jax
 
+from purerl.experiment import objects
 from purerl.experiments.benchmarks.benchmark import Part, Timing, measure
 from purerl.experiments.benchmarks.output import output_file
 from purerl.experiments.peers.gymnasium_ant import experiment
+from purerl.machine.command_errors import leave
 from purerl.ppo import algorithm
 from purerl.ppo.config import Config
 from purerl.ppo.networks import MlpOptions
-from purerl.runs import build_experiment
-from purerl.runs.command_errors import leave
 
 
 class Sizes(NamedTuple):
@@ -86,7 +86,7 @@ def our_network(sizes: Sizes) -> MlpOptions:
 def ours(sizes: Sizes) -> Part:
     """Compiles purerl's training and makes its first update."""
     chosen = replace(experiment, ppo=our_config(sizes), network=our_network(sizes))
-    config, env, network, engine = build_experiment.build(chosen)
+    config, env, network, engine = objects.build(chosen)
     state = jax.jit(partial(algorithm.init, config, env, network))(jax.random.key(chosen.seed))
     update = jax.jit(partial(algorithm.update, config, env, network), donate_argnums=0)
     trainer = Ours(update, state)

@@ -55,7 +55,7 @@ def is_first() -> bool:
     return jax.process_index() == 0
 
 
-def alone(function: Callable[[], Any]) -> Any:
+def in_first_process(function: Callable[[], Any]) -> Any:
     """Calls `function` in the first process only; its result (JSON) or error is everybody's."""
     if jax.process_count() == 1:
         return function()
@@ -72,6 +72,16 @@ def alone(function: Callable[[], Any]) -> Any:
     if problem:
         raise UserError(problem)
     return result
+
+
+def kept_by_first(function: Callable[[], Any]) -> Any:
+    """Calls `function` in the first process only, which keeps the result; its error is everybody's.
+
+    Of the others it is None.
+    """
+    kept: list[Any] = []
+    in_first_process(lambda: kept.append(function()))
+    return kept[0] if kept else None
 
 
 def of_first(tree: PyTree) -> PyTree:
@@ -135,9 +145,9 @@ class Silent:
 
     digest = None
 
-    def __init__(self, folder: Path | None = None) -> None:
-        """Names the run's checkpoints, for messages."""
-        self.checkpoints = folder / "checkpoints" if folder else None
+    def __init__(self, checkpoints: Path | None = None) -> None:
+        """Names the folder of the run's checkpoints, for messages."""
+        self.checkpoints = checkpoints
         self.say = self.show = self.write = self._nothing
         self.save = self.finish = self.close = self._nothing
 

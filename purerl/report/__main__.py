@@ -12,13 +12,13 @@ from typing import Annotated
 import tyro
 
 from purerl.core.errors import UserError
-from purerl.runs.command_errors import leave
-from purerl.runs.command_line import carry_out
-from purerl.runs.output import show
+from purerl.experiment.command_line import carry_out
+from purerl.machine.command_errors import leave
+from purerl.machine.output import show
 
 
 @dataclass(frozen=True)
-class Options:
+class ReportOptions:
     """Makes one HTML file about runs: curves, every metric, evaluations, settings, videos."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
@@ -32,14 +32,14 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return carry_out(Options, command, "python -m purerl.report", arguments)
+    return carry_out(ReportOptions, command, "python -m purerl.report", arguments)
 
 
-def command(options: Options) -> None:
+def command(options: ReportOptions) -> None:
     """Writes the page, and prints where it is."""
+    from purerl.machine.files import write_answer
     from purerl.report.page import make_page
     from purerl.report.run_reader import find_runs, read
-    from purerl.runs.files import write_answer
 
     if not options.runs:
         raise UserError("Give the runs to report: python -m purerl.report RUN RUN ...")

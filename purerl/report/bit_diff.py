@@ -4,6 +4,7 @@ from typing import Any
 
 from purerl.report.run_reader import RunRecord
 from purerl.runs import checkpoint_folder, manifest
+from purerl.runs.folder import CHECKPOINTS
 
 SHOWN = 3  # differing leaves that are named
 
@@ -70,7 +71,7 @@ def _first_metrics_that_differ(a: RunRecord, b: RunRecord) -> list[str]:
 
 def _first_leaves_that_differ(a: RunRecord, b: RunRecord) -> tuple[str, list[str]]:
     """Looks through the checkpoints that both still have; returns a line, and the leaves' paths."""
-    folders = [run.path / "checkpoints" for run in (a, b)]
+    folders = [run.path / CHECKPOINTS for run in (a, b)]
     for update in checkpoint_folder.common_updates(folders):
         paths = [checkpoint_folder.path_of(folder, update) for folder in folders]
         try:

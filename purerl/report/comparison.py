@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import UserError
+from purerl.machine.files import write_json
+from purerl.machine.output import printable
 from purerl.report import bit_diff, run_reader, seed_statistics
 from purerl.report.bootstrap import LEAST_RUNS
 from purerl.report.seed_statistics import Curve
 from purerl.runs import manifest
-from purerl.runs.files import write_json
-from purerl.runs.output import printable
 
 # A table's columns: what stands above, and the key of the value.
 GROUPS = [

@@ -9,11 +9,11 @@ import numpy as np
 
 from purerl.core.keys import Purpose, derive
 from purerl.core.records import Array, TrainState
+from purerl.experiment.objects import Setup
+from purerl.machine.state_arrays import Leaves, flatten
 from purerl.ppo import distributions
 from purerl.ppo.evaluation import Progress, advance, start
 from purerl.ppo.rollout import act
-from purerl.runs.build_experiment import Setup
-from purerl.runs.state_arrays import Leaves, flatten
 
 
 def note_modules(noted: dict[str, Array]) -> Callable[..., Any]:

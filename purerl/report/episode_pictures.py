@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from purerl.core.records import Array, TrainState
+from purerl.experiment.objects import Setup
 from purerl.physics.drawing import Picture, take_picture
 from purerl.report.episode_arrays import play
-from purerl.runs.build_experiment import Setup
 
 MAX_FRAMES_PER_SECOND = 50.0
 

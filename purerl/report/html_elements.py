@@ -3,7 +3,7 @@
 import html
 from typing import Any
 
-from purerl.runs.output import printable
+from purerl.machine.output import printable
 
 VOID = {"img", "input", "meta"}  # elements without an end
 

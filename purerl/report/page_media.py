@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from purerl.core.errors import UserError
+from purerl.machine.files import check_inside, read_bytes
 from purerl.report.html_elements import Html, element
-from purerl.runs.files import check_inside, read_bytes
 
 LARGEST = 32 << 20  # [bytes] of a file
 LARGEST_PAGE = 64 << 20  # [bytes] of all files of a page

@@ -7,7 +7,6 @@ import numpy as np
 
 from purerl.core.records import PyTree
 from purerl.report.episode_arrays import record
-from purerl.runs.files import read_json
 from purerl.runs.loaded_run import Run
 
 EPISODES = 8  # that an exported policy is compared on
@@ -73,5 +72,5 @@ def control_range(run: Run) -> np.ndarray | None:
 
 def origin(run: Run) -> dict[str, Any]:
     """Returns which policy it is: of what experiment, after how many steps, of what digest."""
-    name = read_json(run.folder / "config.json")["experiment"]
+    name = run.restored.source.name
     return {"experiment": name, "update": run.update, "steps": run.steps, "digest": run.digest}

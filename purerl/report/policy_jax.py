@@ -9,9 +9,9 @@ import numpy as np
 from jax import export
 
 from purerl.core.records import PyTree
+from purerl.machine.files import write_answer
 from purerl.report.flat_program import batched
 from purerl.report.policy_function import PolicyFunction, policy_function
-from purerl.runs.files import write_answer
 from purerl.runs.loaded_run import Run
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")

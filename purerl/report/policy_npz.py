@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from purerl.core.errors import UserError
+from purerl.machine.files import write_arrays
 from purerl.ppo import networks, running_moments
 from purerl.report.numpy_policy import Policy
 from purerl.report.policy_file import control_range, origin
-from purerl.runs.files import write_arrays
 from purerl.runs.loaded_run import Run
 
 

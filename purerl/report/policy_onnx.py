@@ -12,12 +12,12 @@ import onnxruntime
 from onnx import helper, numpy_helper
 
 from purerl.core.records import Array, PyTree
+from purerl.machine.files import write_answer
 from purerl.report.flat_program import Program, Value, batched, flat_program, sizes
 from purerl.report.onnx_nodes import OPSET, write_step
 from purerl.report.policy_file import control_range, origin
 from purerl.report.policy_function import PolicyFunction, policy_function
 from purerl.report.policy_jax import remembering
-from purerl.runs.files import write_answer
 from purerl.runs.loaded_run import Run
 
 IR_VERSION = 8  # the file format that goes with the operator set

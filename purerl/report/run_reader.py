@@ -7,17 +7,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import UserError
+from purerl.machine.files import check_object
 from purerl.ppo.config import Config
-from purerl.runs.files import (
-    check_is_run,
-    check_object,
-    read_bytes,
-    read_json,
-    read_metrics,
-    runs_in,
-    without_removed,
-)
-from purerl.runs.loggers import MAX_SKIPPED_IN_A_ROW
+from purerl.runs.folder import Folder, allowed_changes, read_run, runs_in
+from purerl.runs.metrics_file import MAX_SKIPPED_IN_A_ROW, read_metrics
 
 NUMBER = int | float | None
 NOT_LEARNING = ("seed", "evaluation")  # settings that tell runs of one configuration apart
@@ -79,26 +72,23 @@ def find_runs(arguments: Iterable[Path]) -> list[Path]:
 
 def read(path: Path) -> RunRecord:
     """Reads one run's folder; executes nothing of it."""
-    check_is_run(path)
-    config = read_json(path / "config.json", experiment=str, settings=dict)
-    settings = check_object(str(path / "config.json"), config["settings"], seed=int, ppo=dict)
+    folder = read_run(path)
+    config, file = folder.config, folder.metrics
+    settings = check_object(f"{path}: settings", config["settings"], seed=int, ppo=dict)
     experiment = {"experiment": config["experiment"]}
-    facts = read_json(path / "manifest.json")
     learning = {k: v for k, v in settings.items() if k not in NOT_LEARNING}
-    went_on = _went_on(str(path / "manifest.json"), facts)
-    file = path / "metrics.jsonl"
     return RunRecord(
         path=path,
         seed=settings["seed"],
-        settings=experiment | _flatten(learning) | experiment | went_on,
-        manifest=facts,
-        source=read_bytes(path / "experiment.py"),
+        settings=experiment | _flatten(learning) | experiment | _went_on(folder),
+        manifest=folder.manifest,
+        source=folder.code,
         lines=[_check_line(f"{file}, line {i}", x) for i, x in enumerate(read_metrics(file), 1)],
         planned=_planned_updates(settings["ppo"]),
     )
 
 
-def _went_on(where: str, facts: dict[str, Any]) -> dict[str, Any]:
+def _went_on(folder: Folder) -> dict[str, Any]:
     """Returns as a setting what was changed while a run was trained, {} if nothing was.
 
     A run that went on with other settings, or other code of its own, is not one that had them from
@@ -107,8 +97,8 @@ def _went_on(where: str, facts: dict[str, Any]) -> dict[str, Any]:
     of_training = ("settings.", "experiment.py", "source.")
     of_none = ("source.purerl.", *(f"settings.{name}" for name in NOT_LEARNING))
     found = []
-    changes = {"allowed_changes": [], **facts}
-    for change in check_object(where, changes, allowed_changes=list)["allowed_changes"]:
+    for change in allowed_changes(folder):
+        where = f"{folder.path}: allowed_changes"
         known = check_object(where, change, after_update=int, changes=list)
         lines = [str(line) for line in known["changes"]]
         told = [x for x in lines if x.startswith(of_training) and not x.startswith(of_none)]
@@ -141,6 +131,6 @@ def _flatten(value: Any, path: str = "") -> dict[str, Any]:
 
 def _planned_updates(ppo: dict[str, Any]) -> int | None:
     try:
-        return Config(**without_removed(ppo)).num_updates
+        return Config(**ppo).num_updates
     except (TypeError, ValueError, ArithmeticError):  # the settings of another version
         return None

@@ -12,11 +12,11 @@ from PIL import Image
 
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.keys import Purpose, derive
+from purerl.machine.files import check_inside
 from purerl.report import run_reader
 from purerl.report.episode_pictures import Recording, episode_pictures, frame_stride, record
 from purerl.report.page_series import RETURN
 from purerl.report.renderer import Renderer
-from purerl.runs.files import check_inside
 from purerl.runs.loaded_run import Run
 
 SHEET = 4  # rows and columns of the contact sheet

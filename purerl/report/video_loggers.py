@@ -5,15 +5,16 @@ from pathlib import Path
 
 from PIL import Image
 
-from purerl.runs.loggers import WandbSink
-from purerl.runs.options import Options
+from purerl.experiment.options import RunOptions
+from purerl.runs.folder import read
+from purerl.training.loggers import WandbSink
 
 GIF_WIDTH = 320  # [pixels]; TensorBoard shows images alone, of which a GIF moves
 GIF_RATE = 10.0  # frames a second
 VIDEO, SHEET = "video", "contact_sheet"  # the names they have there
 
 
-def log_video(options: Options, folder: Path, video: Path, update: int) -> list[str]:
+def log_video(options: RunOptions, folder: Path, video: Path, update: int) -> list[str]:
     """Hands a video and its contact sheet to the loggers that the run has.
 
     Args:
@@ -85,7 +86,7 @@ def log_to_wandb(folder: Path, mode: str, project: str, video: Path, update: int
     """Goes on with the run at Weights & Biases, and logs a video and its contact sheet."""
     import wandb
 
-    sink = WandbSink(folder, mode, project)
+    sink = WandbSink(read(folder), mode, project)
     shown = {
         VIDEO: wandb.Video(str(video), format="mp4"),
         SHEET: wandb.Image(str(video.with_suffix(".png"))),

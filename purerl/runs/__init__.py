@@ -1,5 +1,5 @@
-"""Runs: folders on disk that say how they were made, and can be stopped and resumed exactly.
+"""A run's folder, written and read back: what describes the run, its checkpoints and metrics.
 
-May import: core, exact, ppo, physics, devices. Read: `session.py`, which carries the command out,
-`loop.py` (training), `writer.py` (what it leaves on disk), `manifest.py` (what bits depend on).
+May import: core, exact, ppo, devices, machine, checks, experiment.
+Read: folder, resume, checkpoint.
 """

@@ -19,7 +19,10 @@ import numpy as np
 
 from purerl.core.errors import UserError, one_line
 from purerl.core.records import PyTree
-from purerl.runs import array_files, checkpoint_folder
+from purerl.machine import array_files
+from purerl.machine.files import hash_files, sync, sync_tree
+from purerl.machine.state_arrays import Leaves, digest_leaves, leaf_paths, raw, unflatten
+from purerl.runs import checkpoint_folder
 from purerl.runs.checkpoint_folder import (
     META,
     WRITING,
@@ -28,9 +31,7 @@ from purerl.runs.checkpoint_folder import (
     load_meta,
     path_of,
 )
-from purerl.runs.files import hash_files, sync, sync_tree
 from purerl.runs.identity import Owner, check_owner
-from purerl.runs.state_arrays import Leaves, digest_leaves, leaf_paths, raw, unflatten
 
 
 class Saved(NamedTuple):

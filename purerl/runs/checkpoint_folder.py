@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import UserError, one_line
-from purerl.runs.files import check_plain, hash_file, read_small, sync
+from purerl.machine.files import check_plain, hash_file, read_small, sync
 
 META = "meta.json"
 KINDS = {
@@ -118,9 +118,10 @@ def updates(folder: Path) -> list[int]:
     return sorted(int(name) for name in names if re.fullmatch(r"[0-9]{12}", name))
 
 
-def holds_any(folder: Path) -> bool:
-    """Tells whether there is a checkpoint, or one that was set aside."""
-    return bool(updates(folder)) or any(folder.glob("damaged-*"))
+def listed(folder: Path) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Returns the updates that have a checkpoint, and the names of those that were set aside."""
+    damaged = (path.name for path in folder.glob("damaged-*"))
+    return tuple(updates(folder)), tuple(sorted(damaged))
 
 
 def common_updates(folders: Iterable[Path]) -> list[int]:
@@ -147,9 +148,9 @@ def check_none_lost(folders: Sequence[Path], promised: bool) -> None:
       promised: whether manifest.json says that all of them had one.
     """
     for folder in folders:
-        damaged = sorted(path.name for path in folder.glob("damaged-*"))
-        if damaged or promised or len(updates(folder)) > 1:
-            kept = ", ".join([*damaged, *map(str, updates(folder))])
+        found, damaged = listed(folder)
+        if damaged or promised or len(found) > 1:
+            kept = ", ".join([*damaged, *map(str, found)])
             shared = " that all seeds have" if len(folders) > 1 else ""
             raise UserError(
                 f"{folder} holds no whole checkpoint{shared}, but {kept or 'it had'}: there is "

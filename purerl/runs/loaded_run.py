@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from purerl.core.errors import UserError
-from purerl.runs.files import check_is_run, read_metrics
+from purerl.runs.folder import METRICS, check_is_run
+from purerl.runs.metrics_file import read_metrics
 
 if TYPE_CHECKING:
     from purerl.runs import restored_run
@@ -62,7 +63,7 @@ class Run:
     def restored(self) -> "restored_run.RestoredRun":
         """The experiment rebuilt, and the checkpoint."""
         from purerl.devices.compilation import set_up_jax
-        from purerl.runs.output import show
+        from purerl.machine.output import show
         from purerl.runs.restored_run import restore
 
         set_up_jax(cache=True)
@@ -92,7 +93,7 @@ class Run:
 
         `pandas.DataFrame(run.metrics())` makes a table of them.
         """
-        lines = read_metrics(self.folder / "metrics.jsonl")
+        lines = read_metrics(self.folder / METRICS)
         names = dict.fromkeys(name for line in lines for name in line)
         return {name: [line.get(name) for line in lines] for name in names}
 
@@ -114,8 +115,8 @@ class Run:
         import numpy as np
 
         from purerl.core.keys import Purpose, derive
+        from purerl.experiment.options import check_seed
         from purerl.ppo.evaluation import evaluate
-        from purerl.runs.options import check_seed
 
         check_seed(seed)
         if not isinstance(episodes, Integral):

@@ -14,33 +14,17 @@ from typing import Any
 from purerl import exact
 from purerl.core.errors import UserError
 from purerl.devices.threads import cpu_threads
-from purerl.runs.files import check_object, read_json
-from purerl.runs.source_hashes import source_hashes
+from purerl.experiment.source_hashes import source_hashes
 
 PACKAGES = ["jax", "jaxlib", "mujoco", "mujoco-mjx", "dm-control", "flax", "optax", "numpy"]
 PACKAGES += ["orbax-checkpoint"]
 INFORMATIVE = {"run_id", "name", "git_revision", "git_dirty", "allowed_changes"}
 INFORMATIVE |= {"devices"}  # how many share the shards
-INFORMATIVE |= {"fingerprint", "had_checkpoint"}  # identity.py, run_folder.py
+INFORMATIVE |= {"fingerprint", "had_checkpoint"}  # identity.py, folder.py
 # What these follow from is compared itself.
 INFORMATIVE |= {"experiment_file", "bit_exact", "inexact_because"}
 FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE", "JAX_PLATFORMS", "JAX_ENABLE_X64")
 PORTABLE = "x86-64 with AVX2, portable"  # instead of a processor's model
-
-
-def read(folder: Path) -> dict[str, Any]:
-    """Reads a run's manifest.json; UserError unless it has what is needed to use the run."""
-    path = folder / "manifest.json"
-    facts = read_json(
-        path, run_id=str, name=str, fingerprint=str, experiment_file=str, engine=str, source=dict,
-        num_shards=int, model=str | None,
-    )  # fmt: skip
-    where = f"{path}: allowed_changes"
-    changes = {"allowed_changes": [], **facts}
-    for change in check_object(str(path), changes, allowed_changes=list)["allowed_changes"]:
-        check_object(where, change, fingerprint=str, after_update=int)
-        check_object(where, change.get("of", {}))
-    return facts
 
 
 def collect(
@@ -170,12 +154,10 @@ def processor(what: str) -> str:
     return next((line.partition(":")[2].strip() for line in lines if line.startswith(what)), "")
 
 
-def was_portable(folder: Path) -> bool:
-    """Tells whether a run was begun with portable bits."""
-    try:
-        return read_json(folder / "manifest.json")["device"]["kind"] == PORTABLE
-    except (OSError, LookupError, TypeError, ValueError, UserError):
-        return False  # whoever needs the file says what is wrong with it
+def was_portable(facts: dict[str, Any]) -> bool:
+    """Tells whether the run of a manifest.json was begun with portable bits."""
+    device = facts.get("device")
+    return isinstance(device, dict) and device.get("kind") == PORTABLE
 
 
 def _git(folder: Path) -> dict[str, Any]:

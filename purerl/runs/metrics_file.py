@@ -8,9 +8,22 @@ from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import RunError, UserError
-from purerl.runs.files import sync, write_file
+from purerl.machine.files import check_object, parse, read_bytes, sync, write_file
 
 Record = dict[str, Any]
+LARGEST = 1 << 30  # [bytes]
+MAX_SKIPPED_IN_A_ROW = 10  # minibatches; a run that skips so many cannot go on
+
+
+def read_metrics(path: Path) -> list[Record]:
+    """Reads whole lines of metrics.jsonl: a run that is being written may end in half a line."""
+    if not os.path.lexists(path):
+        return []
+    texts = read_bytes(path, LARGEST).split(b"\n")[:-1]
+    return [
+        check_object(where := f"{path}, line {number}", parse(where, text))
+        for number, text in enumerate(texts, 1)
+    ]
 
 
 class MetricsFile:

@@ -3,19 +3,21 @@
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from purerl.checks.user_code import own_line
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.records import TrainState
 from purerl.devices import memory
 from purerl.devices.programs import abstract_state
-from purerl.runs import checkpoint, checkpoint_folder, experiment, identity, manifest
-from purerl.runs.build_experiment import Setup, build, physics_hash
-from purerl.runs.experiment import Experiment, Source
-from purerl.runs.files import check_is_run, read_json, without_removed
-from purerl.runs.loggers import Say
-from purerl.runs.run_folder import edited
-from purerl.runs.source_hashes import module_file, source_hashes
-from purerl.runs.trust import load_copy
-from purerl.runs.user_code import own_line
+from purerl.experiment import settings_json
+from purerl.experiment.definition import Experiment
+from purerl.experiment.loading import Source
+from purerl.experiment.objects import Setup, build, physics_hash
+from purerl.experiment.source_hashes import module_file, source_hashes
+from purerl.experiment.trust import load_copy
+from purerl.machine.output import Say
+from purerl.runs import checkpoint, checkpoint_folder, identity
+from purerl.runs.folder import CODE, CONFIG, Folder, check_manifest, read_run
+from purerl.runs.resume import edited
 
 
 class RestoredRun(NamedTuple):
@@ -25,6 +27,7 @@ class RestoredRun(NamedTuple):
     setup: Setup
     saved: checkpoint.Saved
     source: Source  # the experiment as its file has it
+    folder: Folder
 
 
 def restore(
@@ -42,14 +45,12 @@ def restore(
       engine: instead of the run's own, where that one is not at hand.
       trust: whether its code may be executed though it is not known; see `trust.load_copy`.
     """
-    folder = Path(folder)
-    check_is_run(folder)
-    config = read_json(folder / "config.json", experiment=str, settings=dict)
-    begun = manifest.read(folder)
-    source = load_copy(folder, config["experiment"], Path(begun["experiment_file"]), trust)
-    known = {k: without_removed(v) if k == "ppo" else v for k, v in config["settings"].items()}
-    settings = _fill(known, experiment.to_json(source.experiment), say)
-    chosen = experiment.from_json(
+    run = read_run(Path(folder))
+    begun = check_manifest(run)
+    original = Path(begun["experiment_file"])
+    source = load_copy(run.path / CODE, run.code, run.config["experiment"], original, trust)
+    settings = _fill(run.config["settings"], settings_json.to_json(source.experiment), say)
+    chosen = settings_json.from_json(
         source.experiment, settings | ({"engine": engine} if engine else {})
     )
     try:
@@ -58,20 +59,24 @@ def restore(
         raise
     except Exception as error:  # of code that trained: it, or its settings, is another since
         what = f"{one_line(error)}{own_line(error)}"
-        raise UserError(f"{folder} cannot be built with its config.json: {what}") from error
+        raise UserError(f"{folder} cannot be built with its {CONFIG}: {what}") from error
     for what in _changed_since(begun, source, setup):
         say(f"{what} is not that of the run any more.")
-    for what in edited(folder):
+    for what in edited(run):
         say(f"Edited since the run: {what}.")
-    return RestoredRun(chosen, setup, read_checkpoint(folder, update, setup, say), source)
+    return RestoredRun(chosen, setup, _read_checkpoint(run, update, setup, say), source, run)
 
 
 def read_checkpoint(folder: Path, update: str, setup: Setup, say: Say) -> checkpoint.Saved:
     """Reads a checkpoint of a run whose objects are built; arguments as for `restore`."""
+    return _read_checkpoint(read_run(folder), update, setup, say)
+
+
+def _read_checkpoint(run: Folder, update: str, setup: Setup, say: Say) -> checkpoint.Saved:
     abstract = abstract_state(*setup[:3])
     abstract = abstract.replace(env=None, episode=None, optimizer=None)
-    _check_memory(folder, memory.size(abstract))
-    return _choose(folder / "checkpoints", update, abstract, say, manifest.read(folder))
+    _check_memory(run.path, memory.size(abstract))
+    return _choose(run, update, abstract, say)
 
 
 def _check_memory(folder: Path, size: int) -> None:
@@ -102,24 +107,22 @@ def _fill(old: Any, new: Any, say: Say, path: str = "") -> Any:
     if not (isinstance(old, dict) and isinstance(new, dict)):
         return old
     for name in new.keys() - old.keys():
-        say(f"config.json lacks {path}{name}; it is taken as {new[name]}.")
+        say(f"{CONFIG} lacks {path}{name}; it is taken as {new[name]}.")
     return new | {name: _fill(old[name], new.get(name), say, f"{path}{name}.") for name in old}
 
 
-def _choose(
-    folder: Path, update: str, abstract: TrainState, say: Say, facts: dict[str, Any]
-) -> checkpoint.Saved:
+def _choose(run: Folder, update: str, abstract: TrainState, say: Say) -> checkpoint.Saved:
     """Reads the checkpoint that was asked for; see `restore`."""
-    owners = identity.owners(facts)
+    folder, owners = run.checkpoints, identity.owners(check_manifest(run))
     if update == "latest":
         whole = checkpoint.newest([folder], abstract, say, rename=False, owners=[owners])
         if not whole:
-            raise UserError(f"{folder.parent} has no whole checkpoint yet.")
+            raise UserError(f"{run.path} has no whole checkpoint yet.")
         return whole[0]
     number = checkpoint_folder.best_update(folder) if update == "best" else update
     if number is None:
         raise UserError(f"No checkpoint in {folder} was taken at an evaluation; try latest.")
-    found = list(map(str, checkpoint_folder.updates(folder)))
+    found = list(map(str, run.updates))
     if str(number) not in found:
         valid = ", ".join(["latest", "best", *found])
         raise UserError(f"There is no checkpoint {update!r} in {folder}. Valid: {valid}.")

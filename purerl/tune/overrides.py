@@ -5,7 +5,8 @@ import enum
 import shlex
 from typing import Any
 
-from purerl.runs.experiment import Experiment, settings
+from purerl.experiment.definition import Experiment
+from purerl.experiment.settings_json import settings_of
 
 ENV = "env"
 
@@ -19,7 +20,7 @@ def option_words(name: str, default: Any, value: Any) -> list[str]:
     ['--env.no-observe-place']
     """
     if dataclasses.is_dataclass(value) and type(value) is type(default):
-        inner = [(f"{name}.{n}", getattr(default, n), v) for n, v in settings(value).items()]
+        inner = [(f"{name}.{n}", getattr(default, n), v) for n, v in settings_of(value).items()]
         return [word for each in inner for word in option_words(*each)]
     if value == default and type(value) is type(default):
         return []
@@ -54,6 +55,8 @@ def train_command(name: str, written: Experiment, chosen: Experiment, env: Any) 
       chosen: the run's, whose other settings are kept.
       env: the environment's options.
     """
-    parts = {n: v for n, v in settings(chosen).items() if dataclasses.is_dataclass(v)} | {ENV: env}
+    parts = {n: v for n, v in settings_of(chosen).items() if dataclasses.is_dataclass(v)} | {
+        ENV: env
+    }
     words = [w for n, v in parts.items() for w in option_words(n, getattr(written, n), v)]
     return shlex.join(["python", "-m", "purerl.run", name, *words])

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import SUCCESS, USAGE, RunError, StoppedError, UserError
-from purerl.runs import experiment as experiments, output
-from purerl.runs.command_errors import tell
-from purerl.runs.command_line import from_command_line, parse
-from purerl.runs.experiment import Experiment, Source
+from purerl.experiment import loading
+from purerl.experiment.command_line import from_command_line, parse
+from purerl.experiment.definition import Experiment
+from purerl.experiment.loading import Source
+from purerl.experiment.options import check_seed
+from purerl.machine import output
+from purerl.machine.command_errors import tell
 from purerl.runs.loaded_run import Run, load
-from purerl.runs.options import check_seed
 from purerl.tune.plan.settings import Settings
 
 SETTABLE = ("env", "engine")  # of an experiment's settings
@@ -85,7 +87,7 @@ def find(words: Sequence[str], prog: str) -> Subject:
         raise UserError(f"The first word must be an experiment or a run: {prog} EXPERIMENT_OR_RUN")
     name = words[0]
     if not Path(name).is_dir():
-        return Subject(name, experiments.find_source(name), None)
+        return Subject(name, loading.find_source(name), None)
     # Options that say how to read the run, whose experiment says which other options there are.
     early: Callable[..., Any] = argparse.ArgumentParser
     parser = early(add_help=False, allow_abbrev=False, exit_on_error=False)

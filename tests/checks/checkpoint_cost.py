@@ -18,9 +18,11 @@ import jax
 
 from purerl.devices import memory, programs
 from purerl.devices.compilation import set_up_jax
+from purerl.experiment import loading, objects
+from purerl.experiment.command_line import from_command_line
+from purerl.machine import state_arrays
 from purerl.ppo import algorithm
-from purerl.runs import build_experiment, checkpoint, experiment, state_arrays
-from purerl.runs.command_line import from_command_line
+from purerl.runs import checkpoint
 
 TIMES = 5
 
@@ -33,10 +35,10 @@ def main() -> None:
     )
     parser.add_argument("words", nargs="+", help="-- EXPERIMENT [--option value ...]")
     words = parser.parse_args().words
-    source = experiment.find_source(words[0])
+    source = loading.find_source(words[0])
     chosen, _ = from_command_line(source, words[1:], "tests.checks.checkpoint_cost")
     set_up_jax(True)
-    setup = build_experiment.build(chosen)
+    setup = objects.build(chosen)
     state = jax.jit(functools.partial(algorithm.init, *setup[:3]))(jax.random.key(1))
     abstract = programs.abstract_state(*setup[:3])
     jax.block_until_ready(state)

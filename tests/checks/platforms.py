@@ -22,11 +22,12 @@ import numpy as np
 
 from purerl import exact
 from purerl.core.records import PyTree
+from purerl.experiment import command_line, objects
+from purerl.experiment.loading import find_source
+from purerl.experiment.objects import Setup
+from purerl.machine import state_arrays
+from purerl.machine.command_errors import leave
 from purerl.ppo import algorithm
-from purerl.runs import build_experiment, command_line, state_arrays
-from purerl.runs.build_experiment import Setup
-from purerl.runs.command_errors import leave
-from purerl.runs.experiment import find_source
 
 ROWS = 12  # shown
 
@@ -46,7 +47,7 @@ def main(arguments: list[str]) -> int:
     jax.config.update("jax_default_matmul_precision", precision)
     prog = f"python -m tests.checks.platforms {options.experiment}"
     experiment, _ = command_line.from_command_line(find_source(options.experiment), overrides, prog)
-    setup = build_experiment.build(experiment)
+    setup = objects.build(experiment)
     if options.write:
         np.savez(options.write, **state_arrays.flatten(make(setup)))
         return 0

@@ -25,9 +25,9 @@ ABOUT = "import platform, jax; print(platform.python_version(), jax.__version__)
 BEGIN = f"""
 import contextlib, itertools, sys
 import purerl
-from purerl.runs import training
+from purerl.training import train
 asked = itertools.chain([False] * 9, itertools.repeat(True))
-training.stop_signals = lambda _: contextlib.nullcontext(lambda: next(asked))
+train.stop_signals = lambda _: contextlib.nullcontext(lambda: next(asked))
 with contextlib.suppress(purerl.StoppedError):
     purerl.train({TOY!r}, runs=sys.argv[1], name="run")
 """

@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 
+from purerl.experiment import objects
 from purerl.ppo import algorithm
-from purerl.runs import build_experiment
 from tests.checks import platforms
 from tests.runs import toy_experiment
 from tests.runs.test_run import TOY
@@ -15,7 +15,7 @@ from tests.runs.test_run import TOY
 def test_what_is_learned_otherwise_is_named(tmp_path, monkeypatch):
     file = tmp_path / "there.npz"
     platforms.ask_cpu([str(TOY), "--write", str(file)])
-    setup, there = build_experiment.build(toy_experiment.experiment), dict(np.load(file))
+    setup, there = objects.build(toy_experiment.experiment), dict(np.load(file))
     assert platforms.compare(setup, there) == {}
     improve = algorithm.improve
 

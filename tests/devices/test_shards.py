@@ -18,8 +18,9 @@ import pytest
 from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
 from purerl.devices import programs, shards
 from purerl.exact import pallas_calls, xla_flags
+from purerl.experiment import objects
 from purerl.ppo.config import Evaluation
-from purerl.runs import build_experiment, checkpoint_folder
+from purerl.runs import checkpoint_folder
 from tests.runs import toy_experiment
 from tests.runs.test_run import ROOT, TOY
 
@@ -189,7 +190,7 @@ def test_passes_that_are_off_are_the_users_too(monkeypatch):
 
 def test_what_learns_from_several_shards_is_compiled_without_them(monkeypatch):
     monkeypatch.setattr(xla_flags, "equal_passes", lambda: {"xla_no_such_option": "1"})
-    config, env, network, _ = build_experiment.build(toy_experiment.experiment)
+    config, env, network, _ = objects.build(toy_experiment.experiment)
     with pytest.raises(Exception, match="xla_no_such_option"):
         programs.compile_programs(
             config, env, network, Evaluation(number=0), True, shards.Shards(2)

@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from unittest import mock
 
 from purerl.__main__ import COMMANDS, module_of
+from purerl.experiment import options
 from purerl.ppo import config, networks
-from purerl.runs import options
 from tests.docs.blocks import ROOT
 
 SETTINGS = ROOT / "docs/reference/settings.md"
@@ -38,7 +38,7 @@ TABLES = {
     "evaluation": (config.Evaluation, "Evaluations during training."),
     "network": (networks.MlpOptions, "Of `networks.mlp`."),
     "network ": (networks.RecurrentOptions, "Of `networks.recurrent`."),
-    "run": (options.Options, "How a run is made, kept and shown: `--resume`, without a prefix."),
+    "run": (options.RunOptions, "How a run is made, kept and shown: `--resume`, without a prefix."),
 }
 
 

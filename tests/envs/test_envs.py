@@ -12,11 +12,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from purerl.checks.check_env import check_env
 from purerl.envs import arenas, cartpole_swingup, run
 from purerl.envs.bodies import ANT, RODENT
 from purerl.experiments.peers import brax_env
 from purerl.physics.interface import PhysicsState
-from purerl.runs.check_env import check_env
 from tests import quick
 
 BUILDERS = {"ant": run.build, "cartpole": cartpole_swingup.build}

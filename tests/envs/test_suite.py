@@ -11,9 +11,9 @@ from dm_control.suite.utils import randomizers
 from dm_control.utils import rewards
 
 from purerl import run
+from purerl.checks.check_env import check_env
 from purerl.envs.suite import base, hopper, tasks
 from purerl.envs.suite.rewards import SIGMOIDS, tolerance
-from purerl.runs.check_env import check_env
 from tests import quick
 
 STATES = 100

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from purerl.core.errors import UserError
+from purerl.experiment.loading import find
 from purerl.experiments.benchmarks import benchmark, scaling, start_up
-from purerl.runs.experiment import find
 
 
 def experiment():

@@ -11,9 +11,9 @@ pytest.importorskip("gymnasium", reason="needs the extra peers")
 
 import gymnasium  # noqa: E402
 
+from purerl.checks.check_env import check_env  # noqa: E402
 from purerl.core.errors import UserError  # noqa: E402
 from purerl.envs import gymnasium_ant  # noqa: E402
-from purerl.runs.check_env import check_env  # noqa: E402
 from tests import quick  # noqa: E402
 
 pytestmark = pytest.mark.slow

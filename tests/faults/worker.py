@@ -117,7 +117,7 @@ def busy_after(threads: Iterable[threading.Thread], seconds: float = 3.0) -> str
 
 def keep_programs() -> None:
     """Lets commands with the same settings share the compiled programs."""
-    from purerl.runs import session
+    from purerl.training import session
 
     compile_programs, made = session.compile_programs, dict[str, Any]()
 

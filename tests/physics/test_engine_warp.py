@@ -26,8 +26,8 @@ pytest.importorskip("warp", reason="engine 'warp' needs warp-lang: pip install -
 
 import warp  # noqa: E402
 
+from purerl.checks.check_env import check_env  # noqa: E402
 from purerl.physics import engine_warp, warp_buffers  # noqa: E402
-from purerl.runs.check_env import check_env  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

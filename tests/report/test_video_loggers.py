@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from purerl import run
+from purerl.experiment.options import RunOptions
 from purerl.report.video_loggers import as_gif, log_video
-from purerl.runs.options import Options
 from tests.report.test_render import TINY
 
 SIZE = (64, 48)
@@ -74,7 +74,7 @@ def test_a_gif_shows_the_video_in_its_own_time(video):
 
 def test_tensorboard_has_the_video_and_its_sheet(video):
     pytest.importorskip("tensorboardX")
-    assert len(log_video(Options(tensorboard=True), video.parents[1], video, 7)) == 1
+    assert len(log_video(RunOptions(tensorboard=True), video.parents[1], video, 7)) == 1
     found = images(video.parents[1])
     assert {name: step for name, (step, _) in found.items()} == {"video": 7, "contact_sheet": 7}
     assert len(frames(found["video"][1].encoded_image_string)[0]) >= 3
@@ -85,14 +85,14 @@ def test_tensorboard_has_the_video_and_its_sheet(video):
 
 def test_without_loggers_nothing_is_written(video):
     before = sorted(video.parents[1].rglob("*"))
-    assert log_video(Options(), video.parents[1], video, 7) == []
+    assert log_video(RunOptions(), video.parents[1], video, 7) == []
     assert sorted(video.parents[1].rglob("*")) == before
 
 
 @pytest.mark.slow
 def test_wandb_has_the_video_and_its_sheet(video):
     pytest.importorskip("wandb")
-    log_video(Options(wandb="offline"), video.parents[1], video, 7)
+    log_video(RunOptions(wandb="offline"), video.parents[1], video, 7)
     (files,) = video.parents[1].glob("wandb/offline-run-*-0123456789ab/files/media")
     (mp4,) = files.rglob("*.mp4")
     assert mp4.read_bytes() == video.read_bytes()

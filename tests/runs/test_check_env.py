@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from purerl.checks import check_traces
+from purerl.checks.check_env import check_env
 from purerl.core.env import EnvError, State
-from purerl.runs import check_traces
-from purerl.runs.check_env import check_env
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from purerl.core.errors import UserError
-from purerl.runs import array_files, checkpoint, checkpoint_folder, state_arrays
+from purerl.machine import array_files, state_arrays
+from purerl.runs import checkpoint, checkpoint_folder
 
 
 def make_state(number: float = 1.0):

@@ -3,7 +3,7 @@
 import pytest
 
 from purerl.ppo.config import Config
-from purerl.runs.console import engine_remark, training_episodes
+from purerl.training.console import engine_remark, training_episodes
 
 
 @pytest.mark.parametrize(

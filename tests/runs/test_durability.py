@@ -15,8 +15,9 @@ import jax.numpy as jnp
 import pytest
 
 from purerl.core.errors import FAILURE, SUCCESS, RunError, UserError
-from purerl.runs import array_files, checkpoint, checkpoint_folder, files, state_arrays
-from purerl.runs.lock import RunLock
+from purerl.machine import array_files, files, state_arrays
+from purerl.machine.lock import FolderLock
+from purerl.runs import checkpoint, checkpoint_folder
 from tests.runs.test_run import (
     checkpoints,
     digest,
@@ -315,21 +316,21 @@ def test_metrics_that_are_removed_while_the_run_writes_them_end_it(tmp_path, mon
 
 
 def test_a_deleted_lock_file_lets_nobody_in(tmp_path):
-    held = RunLock(tmp_path / "run")
+    held = FolderLock(tmp_path / "run")
     (tmp_path / "run" / ".lock").unlink()
     with pytest.raises(UserError, match=f"process (unknown|{os.getpid()})"):
-        RunLock(tmp_path / "run")
+        FolderLock(tmp_path / "run")
     held.close()
-    RunLock(tmp_path / "run").close()
+    FolderLock(tmp_path / "run").close()
 
 
 def test_who_only_looks_whether_a_run_is_locked_keeps_nobody_out(tmp_path):
     """A look holds the lock for a moment, which the one who wants to train waits for."""
-    held = RunLock(tmp_path / "run")
+    held = FolderLock(tmp_path / "run")
     threading.Timer(0.2, held.close).start()
     with pytest.raises(UserError):
-        RunLock(tmp_path / "run", patience=0.0)
-    RunLock(tmp_path / "run").close()
+        FolderLock(tmp_path / "run", patience=0.0)
+    FolderLock(tmp_path / "run").close()
 
 
 @pytest.mark.parametrize("refuses", ["folders", "everything"])
@@ -344,11 +345,11 @@ def test_a_file_system_without_locks_is_used_all_the_same(tmp_path, monkeypatch,
         real(handle, how)
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    held = RunLock(tmp_path / "run")
+    held = FolderLock(tmp_path / "run")
     assert held.locks == (refuses == "folders")
     if held.locks:
         with pytest.raises(UserError, match=f"process {os.getpid()}"):
-            RunLock(tmp_path / "run")
+            FolderLock(tmp_path / "run")
     held.check()
     (tmp_path / "run").rename(tmp_path / "away")
     with pytest.raises(RunError, match="moved or removed"):

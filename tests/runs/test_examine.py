@@ -10,15 +10,16 @@ import mujoco
 import numpy as np
 import pytest
 
+from purerl.checks import examine_env, examine_network
+from purerl.checks.watch_physics import check_controls, check_placed
 from purerl.core.records import Network, Normal, PolicyOutput
 from purerl.devices import memory
 from purerl.devices.programs import abstract_state
+from purerl.experiment import examine
+from purerl.experiment.objects import build
 from purerl.physics.interface import Physics
 from purerl.ppo.config import Config
 from purerl.ppo.networks import MlpOptions, RecurrentOptions, from_linen, mlp, recurrent
-from purerl.runs import examine, examine_env, examine_network
-from purerl.runs.build_experiment import build
-from purerl.runs.watch_physics import check_controls, check_placed
 from tests.runs.test_check_env import Toy, toy_state
 from tests.runs.toy_experiment import experiment
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from purerl.core.errors import UserError
-from purerl.runs import experiment, run_folder
+from purerl.experiment import loading, settings_json
+from purerl.runs import resume
 
 TOY = Path(__file__).parent / "toy_experiment.py"
 
@@ -26,10 +27,10 @@ def test_an_experiment_is_found_by_name_path_and_module(place):
         ("experiments/hopper.py", "hopper"),
         ("tests.runs.toy_experiment", "toy_experiment"),
     ]:
-        source = experiment.find_source(name)
+        source = loading.find_source(name)
         assert source.name == expected and source.experiment.env.steps == 4
     (place / "experiments" / "plot.py").write_text('"""A script."""\n')
-    found = experiment.available()
+    found = loading.available()
     assert "hopper" in found and not {"plot", "benchmark"} & set(found)
 
 
@@ -37,15 +38,15 @@ def test_what_cannot_be_read_beside_the_experiments_harms_none(place):
     (place / "experiments" / ".#hopper.py").symlink_to("nobody@host.123")  # as Emacs locks a file
     (place / "experiments" / "gone.py").symlink_to("nowhere")
     (place / "experiments" / "latin.py").write_bytes(b"# caf\xe9\nexperiment = None\n")
-    found = experiment.available()
+    found = loading.available()
     assert "hopper" in found and "latin" in found and not {"gone", ".#hopper"} & set(found)
-    assert experiment.summary(found["latin"]) == ""
+    assert loading.summary(found["latin"]) == ""
 
 
 @pytest.mark.parametrize("name", ["hoper", "experiments/none.py", "tests.none_such", "no_such.x"])
 def test_an_unknown_experiment_is_one_line(place, name):
     with pytest.raises(UserError) as error:
-        experiment.find_source(name)
+        loading.find_source(name)
     assert "\n" not in str(error.value)
     if name == "hoper":
         assert "Did you mean 'hopper'?" in str(error.value)
@@ -59,26 +60,26 @@ def test_a_mistake_in_the_file_names_its_line(tmp_path):
     ]:
         (tmp_path / "bad.py").write_text(text)
         with pytest.raises(UserError, match=message):
-            experiment.load(tmp_path / "bad.py")
+            loading.load(tmp_path / "bad.py")
 
 
 def test_a_module_beside_the_file_is_found_with_the_path_that_the_error_names(tmp_path):
     file = tmp_path / "mine.py"
     file.write_text("import rewards_beside\n")
     with pytest.raises(UserError) as error:
-        experiment.load(file)
+        loading.load(file)
     assert "PYTHONPATH" not in str(error.value)
     (tmp_path / "rewards_beside.py").write_text("UPRIGHT = 1\n")
     with pytest.raises(UserError, match=f"PYTHONPATH={tmp_path}$"):
-        experiment.load(file)
+        loading.load(file)
 
 
 def test_settings_survive_json():
-    chosen = experiment.load(TOY).experiment
+    chosen = loading.load(TOY).experiment
     network = dataclasses.replace(chosen.network, policy_hidden=(5, 6))
     changed = dataclasses.replace(chosen, seed=7, network=network)
-    values = json.loads(json.dumps(experiment.to_json(changed)))
-    assert experiment.from_json(chosen, values) == changed
+    values = json.loads(json.dumps(settings_json.to_json(changed)))
+    assert settings_json.from_json(chosen, values) == changed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,20 +95,20 @@ class Parts:
 
 
 def test_dataclasses_in_tuples_and_tuples_in_dicts_survive_json():
-    chosen = dataclasses.replace(experiment.load(TOY).experiment, env=Parts())
+    chosen = dataclasses.replace(loading.load(TOY).experiment, env=Parts())
     env = Parts(several=(Part(2.0), Part(3.0)), named={"a": (3, 4), "b": (5,)})
     changed = dataclasses.replace(chosen, env=env)
-    values = json.loads(json.dumps(experiment.to_json(changed)))
-    assert experiment.from_json(chosen, values) == changed
+    values = json.loads(json.dumps(settings_json.to_json(changed)))
+    assert settings_json.from_json(chosen, values) == changed
 
 
 def test_a_setting_that_could_not_be_read_back_is_refused_before_training():
-    source = experiment.load(TOY)
+    source = loading.load(TOY)
     source = source._replace(experiment=dataclasses.replace(source.experiment, env=Parts()))
-    run_folder.describe(source, source.experiment, {})
+    resume.describe_config(source, source.experiment, {})
     chosen = dataclasses.replace(source.experiment, env=Parts(one=Part()))
     with pytest.raises(UserError, match="cannot hold env: .*one=Part"):
-        run_folder.describe(source, chosen, {})
+        resume.describe_config(source, chosen, {})
 
 
 def test_a_mistake_in_a_module_names_its_line(tmp_path, monkeypatch):
@@ -123,30 +124,30 @@ def test_a_mistake_in_a_module_names_its_line(tmp_path, monkeypatch):
         if "imports" in message:
             (tmp_path / "mods" / "mod0.py").write_text("")
         with pytest.raises(UserError, match=message):
-            experiment.find_source(f"mods.mod{i}")
+            loading.find_source(f"mods.mod{i}")
 
 
 def test_missing_and_unknown_settings_are_named():
-    chosen = experiment.load(TOY).experiment
-    values = experiment.to_json(chosen)
+    chosen = loading.load(TOY).experiment
+    values = settings_json.to_json(chosen)
     del values["env"]["steps"]
     with pytest.raises(UserError, match="lacks env.steps"):
-        experiment.from_json(chosen, values)
-    values = experiment.to_json(chosen)
+        settings_json.from_json(chosen, values)
+    values = settings_json.to_json(chosen)
     values["ppo"]["learning_rat"] = 1.0
     with pytest.raises(UserError, match="ppo.learning_rat'.*Did you mean 'ppo.learning_rate"):
-        experiment.from_json(chosen, values)
+        settings_json.from_json(chosen, values)
 
 
 def test_a_setting_that_json_cannot_hold_is_named():
-    chosen = experiment.load(TOY).experiment
+    chosen = loading.load(TOY).experiment
     env = dataclasses.replace(chosen.env, name=len)
     with pytest.raises(UserError, match=r"env.name is a builtin_function"):
-        experiment.to_json(dataclasses.replace(chosen, env=env))
+        settings_json.to_json(dataclasses.replace(chosen, env=env))
 
 
 def test_a_name_whose_file_is_here_is_told_the_file(tmp_path, monkeypatch):
     (tmp_path / "track.py").write_text("")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match="as track.py"):
-        experiment.find_source("track")
+        loading.find_source("track")

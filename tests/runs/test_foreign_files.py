@@ -14,7 +14,8 @@ import pytest
 import purerl
 from purerl import compare, evaluate, run
 from purerl.core.errors import FAILURE, SUCCESS, USAGE
-from purerl.runs import checkpoint_folder, files
+from purerl.machine import files
+from purerl.runs import checkpoint_folder
 
 pytestmark = pytest.mark.slow
 

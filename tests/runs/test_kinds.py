@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import pytest
 
 from purerl.core.errors import UserError
+from purerl.experiment import objects
+from purerl.experiment.kinds import wrong_value
 from purerl.experiments import cartpole_swingup
-from purerl.runs import build_experiment
-from purerl.runs.kinds import wrong_value
 
 EXPERIMENT = cartpole_swingup.experiment
 
@@ -45,7 +45,7 @@ def changed(part, **settings):
 def test_a_value_of_the_wrong_kind_is_told_and_never_trained(experiment, told):
     assert wrong_value(experiment) == told
     with pytest.raises(UserError, match="The experiment's "):
-        build_experiment.build(experiment)
+        objects.build(experiment)
 
 
 def test_a_text_for_a_number_is_told_by_its_setting():

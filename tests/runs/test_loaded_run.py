@@ -15,8 +15,10 @@ import pytest
 import purerl
 from purerl import evaluate
 from purerl.core.keys import Purpose, derive, per_environment
+from purerl.experiment import loading
 from purerl.report.episode_arrays import record
-from purerl.runs import experiment, loaded_run, policy, training
+from purerl.runs import loaded_run, policy
+from purerl.training import train
 from tests.golden import privileged, recurrent
 
 ROOT = Path(__file__).parent.parent.parent
@@ -162,10 +164,10 @@ def test_a_folder_without_a_run_is_one_line(run, tmp_path):
 
 
 def test_the_examples_in_the_docstrings_hold(tmp_path, capsys):
-    names = {"train": training.train, "load": loaded_run.load, "np": np, "place": tmp_path}
-    names |= {"find": experiment.find, "folder": tmp_path / "cartpole_swingup" / "first"}
+    names = {"train": train.train, "load": loaded_run.load, "np": np, "place": tmp_path}
+    names |= {"find": loading.find, "folder": tmp_path / "cartpole_swingup" / "first"}
     finder, runner = doctest.DocTestFinder(recurse=False), doctest.DocTestRunner()
-    for thing in (experiment.find, training.train, loaded_run.load, policy.Policy):
+    for thing in (loading.find, train.train, loaded_run.load, policy.Policy):
         (test,) = finder.find(thing, globs=dict(names))
         assert test.examples
         runner.run(test)

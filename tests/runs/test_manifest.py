@@ -17,11 +17,11 @@ from purerl import exact
 from purerl.devices import programs
 from purerl.devices.shards import Shards
 from purerl.exact import xla_flags
+from purerl.experiment.loading import load
+from purerl.experiment.objects import build
 from purerl.ppo import algorithm
 from purerl.ppo.config import Evaluation
-from purerl.runs import manifest, run_folder
-from purerl.runs.build_experiment import build
-from purerl.runs.experiment import load
+from purerl.runs import manifest, resume
 from purerl.runs.identity import fingerprint
 
 ROOT = Path(__file__).parent.parent.parent
@@ -153,9 +153,11 @@ def test_a_run_on_c_imports_no_other_engine():
     """MJX takes most of a second to import, Warp two; a run on engine `c` needs neither."""
     lines = [
         "import sys",
-        "from purerl.runs import build_experiment, experiment, manifest",
-        "chosen = experiment.find('ant_run')",
-        "setup = build_experiment.build(chosen)",
+        "import purerl",
+        "from purerl.experiment import objects",
+        "from purerl.runs import manifest",
+        "chosen = purerl.find('ant_run')",
+        "setup = objects.build(chosen)",
         "manifest.collect(setup.engine, [chosen.build_env, chosen.build_network])",
         "assert setup.engine == 'c'",
         "print([name for name in sys.modules if name in ('mujoco.mjx', 'warp')])",
@@ -169,7 +171,7 @@ def test_a_run_on_c_imports_no_other_engine():
     ("found", "cure"),
     [
         (["versions.jax: 0.10.2 -> 0.11.2"], "the command it was begun with"),
-        (["settings.ppo.gamma: 0.99 -> 0.9", run_folder.EDITED], "Put the file back"),
+        (["settings.ppo.gamma: 0.99 -> 0.9", resume.EDITED], "Put the file back"),
         (["vmapped_seeds: {'first': 1, 'number': 3} -> (absent)"], "--num-seeds and --seed"),
         (["schedule.log_every: 1 -> 2", "settings.ppo.num_steps: 9 -> 99"], "go_on.md"),
         (
@@ -190,7 +192,7 @@ def test_a_run_on_c_imports_no_other_engine():
 )
 def test_a_refusal_to_go_on_names_what_helps(found, cure):
     """The command that a run was begun with helps neither an edited file nor a longer run."""
-    assert cure in run_folder.cure(found)
+    assert cure in resume.cure(found)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from purerl import new
-from purerl.runs.new_project import write_project
+from purerl.experiment.new_project import write_project
 
 ROOT = Path(new.__file__).parent.parent
 

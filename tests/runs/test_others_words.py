@@ -7,20 +7,20 @@ from pathlib import Path
 import pytest
 
 from purerl import Config, Evaluation
-from purerl.runs import others_words
+from purerl.experiment import other_trainers
 
 OURS = [
     f"--{group}.{field.name.replace('_', '-')}"
     for group, kind in (("ppo", Config), ("evaluation", Evaluation))
     for field in dataclasses.fields(kind)
 ]
-PAGE = Path(__file__).parents[2] / others_words.PAGE
+PAGE = Path(__file__).parents[2] / other_trainers.PAGE
 
 
-@pytest.mark.parametrize("theirs", others_words.COUNTERPARTS)
+@pytest.mark.parametrize("theirs", other_trainers.COUNTERPARTS)
 def test_each_word_has_a_setting_and_is_on_the_page(theirs):
-    ours, conversion = others_words.COUNTERPARTS[theirs]
-    answer = others_words.meant(f"--ppo.{theirs.replace('_', '-')}", OURS)
+    ours, conversion = other_trainers.COUNTERPARTS[theirs]
+    answer = other_trainers.suggest(f"--ppo.{theirs.replace('_', '-')}", OURS)
     assert re.match(rf"Did you mean --\w+\.{ours.replace('_', '-')} \(", answer)
     assert conversion in answer
     assert f"`{theirs}`" in PAGE.read_text()
@@ -31,4 +31,4 @@ def test_each_word_has_a_setting_and_is_on_the_page(theirs):
     [("discount", "gamma"), ("num-steps-per-env", "rollout-length"), ("lam", "gae-lambda")],
 )
 def test_words_that_look_like_another_setting_or_none(theirs, ours):
-    assert f"--ppo.{ours} " in others_words.meant(f"--ppo.{theirs}", OURS)
+    assert f"--ppo.{ours} " in other_trainers.suggest(f"--ppo.{theirs}", OURS)

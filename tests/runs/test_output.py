@@ -15,9 +15,9 @@ import pytest
 import purerl
 from purerl import run
 from purerl.core.errors import FAILURE, SUCCESS, USAGE, RunError, UserError
+from purerl.machine import command_errors, output
+from purerl.machine.files import write_answer
 from purerl.report import opengl
-from purerl.runs import command_errors, output
-from purerl.runs.files import write_answer
 from tests.runs.test_run import ROOT, TOY, digest, folder, whole  # noqa: F401
 
 pytestmark = pytest.mark.slow

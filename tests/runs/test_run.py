@@ -23,20 +23,12 @@ from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
 from purerl.devices import compilation
 from purerl.devices.programs import compile_programs
 from purerl.devices.shards import Shards
+from purerl.experiment import objects
+from purerl.experiment.loading import find
+from purerl.machine import command_errors, files, state_arrays
 from purerl.ppo.config import Evaluation
-from purerl.runs import (
-    build_experiment,
-    checkpoint,
-    checkpoint_folder,
-    command_errors,
-    console,
-    files,
-    run_folder,
-    state_arrays,
-    training,
-    writer,
-)
-from purerl.runs.experiment import find
+from purerl.runs import checkpoint, checkpoint_folder, folder as run_folder, resume
+from purerl.training import console, train, writer
 
 TOY = Path(__file__).parent / "toy_experiment.py"
 ROOT = TOY.parent.parent.parent
@@ -98,7 +90,7 @@ def stop_after(monkeypatch):
     """Makes the next run stop by itself after some questions."""
 
     def use(questions: int) -> None:
-        monkeypatch.setattr(training, "stop_signals", lambda _: one(questions))
+        monkeypatch.setattr(train, "stop_signals", lambda _: one(questions))
 
     @contextlib.contextmanager
     def one(questions):
@@ -216,7 +208,7 @@ def test_a_run_killed_in_its_first_save_begins_as_it_did(whole, tmp_path, stop_a
 def test_a_beginning_has_the_same_bits_however_it_is_compiled(num_shards):
     chosen = find("cartpole_swingup")
     chosen = dataclasses.replace(chosen, engine="c", evaluation=Evaluation(number=0))
-    setup = build_experiment.build(chosen)
+    setup = objects.build(chosen)
     digests = set()
     for fresh in (True, False):  # ahead of time, or when it is called
         compiled = compile_programs(
@@ -389,7 +381,7 @@ def test_non_finite_learning_stops_and_is_never_saved(
 
 
 def test_a_failing_logger_does_not_stop_training(whole, tmp_path, monkeypatch, capsys):
-    from purerl.runs import loggers
+    from purerl.training import loggers
 
     def fail(self, record):
         raise RuntimeError("the server is on fire")
@@ -523,7 +515,7 @@ def test_ctrl_c_before_anything_has_begun_is_no_traceback():
 def test_a_thread_that_waits_for_ever_does_not_keep_the_process():
     code = """
 import threading
-from purerl.runs import command_errors
+from purerl.machine import command_errors
 command_errors.LAST_SECONDS = 0.5
 def command():
     threading.Thread(target=threading.Event().wait).start()
@@ -559,10 +551,11 @@ def test_a_disk_that_is_full_at_the_start_is_one_line(tmp_path, monkeypatch, cap
 
 def test_a_start_that_was_killed_half_way_can_be_made_again(tmp_path):
     (tmp_path / ".manifest.json.draft").touch()
-    run_folder.check_new_or_resume({tmp_path: find(str(TOY))}, resume=False)
+    toy = [find(str(TOY))]
+    resume.check_new_or_resume([run_folder.read(tmp_path)], toy, resume=False)
     (tmp_path / "notes.txt").touch()
     with pytest.raises(errors.UserError, match=r"no run \(it holds notes.txt\)"):
-        run_folder.check_new_or_resume({tmp_path: find(str(TOY))}, resume=False)
+        resume.check_new_or_resume([run_folder.read(tmp_path)], toy, resume=False)
 
 
 @pytest.mark.parametrize(
@@ -614,7 +607,7 @@ def test_the_second_signal_ends_at_once(monkeypatch, capsys):
     ended = []
     before = signal.getsignal(signal.SIGINT)  # not Python's own in a background job
     monkeypatch.setattr(os, "_exit", ended.append)
-    with training.stop_signals(os._exit) as stop:
+    with train.stop_signals(os._exit) as stop:
         assert not stop()
         os.kill(os.getpid(), signal.SIGTERM)
         assert stop() and not ended

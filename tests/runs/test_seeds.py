@@ -10,16 +10,9 @@ import pytest
 from purerl import run
 from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE, RunError, UserError
 from purerl.devices import programs
-from purerl.runs import (
-    checkpoint,
-    checkpoint_folder,
-    console,
-    loop,
-    session,
-    state_arrays,
-    training,
-    writer,
-)
+from purerl.machine import state_arrays
+from purerl.runs import checkpoint, checkpoint_folder
+from purerl.training import console, loop, session, train, writer
 from tests.runs.test_run import ROOT, TOY, Stopper, digest, folder, lines, start
 
 CARTPOLE = ["--ppo.num-envs", "4", "--ppo.rollout-length", "8", "--ppo.num-steps", "128"]
@@ -46,7 +39,7 @@ def stop_after(monkeypatch):
         def signals(_):
             yield Stopper(questions)
 
-        monkeypatch.setattr(training, "stop_signals", signals)
+        monkeypatch.setattr(train, "stop_signals", signals)
 
     return use
 

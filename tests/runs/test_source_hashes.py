@@ -1,8 +1,10 @@
 """Whatever of the source can change a run's bits is hashed, so that --resume notices an edit."""
 
+import ast
 import functools
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -14,18 +16,20 @@ import purerl
 from purerl import run
 from purerl.core.errors import SUCCESS, USAGE
 from purerl.devices import compilation
+from purerl.experiment import source_hashes
 from purerl.ppo import losses
-from purerl.runs import run_folder, source_hashes
+from purerl.runs.loaded_run import Run
 from purerl.runs.manifest import differences
 from tests.ppo.probes import Probe
+from tests.test_rooms import MODULES, own
 
 ROOT = Path(__file__).parent.parent.parent
 TOY = Path(__file__).parent / "toy_experiment.py"
-IMPORTED = {"envs", "experiments", "assets"}  # counted where a builder imports them
-FOLDERS = {path.parent.name for path in (ROOT / "purerl").glob("*/__init__.py")}
-ROOMS = sorted(FOLDERS - IMPORTED)
-LOOKING = {"report", "tune"}  # they only start runs, or look at what they wrote
-AN_EDIT = "\n# An edit.\n"
+COMPUTING = ["adapters", "core", "devices", "exact", "physics", "ppo"]  # rooms
+AN_EDIT = "\nEDITED = True\n"
+# What moves no bit.
+COMMENT = '\n# A comment.\n"""A text, where a docstring stands."""\n'
+SIGNS = {ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "+"), ast.Div: ("/", "*")}
 
 
 @pytest.fixture
@@ -35,27 +39,79 @@ def copy(tmp_path) -> Path:
     return shutil.copytree(source_hashes.PACKAGE, tmp_path / "copy" / "purerl", ignore=ignored)
 
 
-def edit(file: Path) -> None:
+def edit(file: Path, text: str = AN_EDIT) -> None:
     assert file.exists()
-    file.write_text(file.read_text() + AN_EDIT)
+    file.write_text(file.read_text() + text)
 
 
-def modules(room: Path) -> list[Path]:
-    return [file for file in room.rglob("*.py") if file.name != "__init__.py"]
+def change_operator(file: Path) -> bool:
+    """Changes the sign of a file's first sum or product; False if it has none on one line."""
+    lines = file.read_text().splitlines(keepends=True)
+    for node in ast.walk(ast.parse("".join(lines))):
+        if isinstance(node, ast.BinOp) and type(node.op) in SIGNS:
+            begin, end = node.left.end_col_offset, node.right.col_offset
+            old, new = SIGNS[type(node.op)]
+            between = lines[node.lineno - 1][begin:end]
+            if node.lineno == node.end_lineno and between.count(old) == 1:
+                line = lines[node.lineno - 1]
+                lines[node.lineno - 1] = line[:begin] + between.replace(old, new) + line[end:]
+                file.write_text("".join(lines))
+                return True
+    return False
 
 
 def changed_by(copy: Path, change) -> list[str]:
     before = source_hashes.source_hashes([], copy)
     change()
     found = differences({"source": before}, {"source": source_hashes.source_hashes([], copy)})
-    return [line.split(":")[0] for line in found]
+    return [line.split(":")[0].removeprefix("source.") for line in found]
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_an_edit_of_any_module_of_a_room_is_named_unless_the_room_only_looks(copy, room):
-    files = modules(copy / room)
-    expected = [] if room in LOOKING else [f"source.purerl.{room}.{file.stem}" for file in files]
-    assert files and changed_by(copy, lambda: [*map(edit, files)]) == sorted(expected)
+def test_an_operator_of_any_module_that_computes_is_named(copy):
+    files = source_hashes.package_files(copy)
+    assert {name.split(".")[1] for name in files} == set(COMPUTING)
+    edited = []
+
+    def change():
+        edited.extend(sorted(name for name, file in files.items() if change_operator(file)))
+
+    assert changed_by(copy, change) == edited
+    assert {name.split(".")[1] for name in edited} >= {"core", "devices", "exact", "physics", "ppo"}
+    assert {"purerl.ppo.losses", "purerl.core.parts", "purerl.physics.engine_c"} <= set(edited)
+
+
+def test_a_comment_and_a_docstring_change_no_hash(copy):
+    files = source_hashes.package_files(copy)
+
+    def change():
+        for file in files.values():
+            edit(file, COMMENT)
+            text = re.sub(r'^( *)"""', r'\1"""Once more: ', file.read_text(), flags=re.M, count=1)
+            file.write_text(text.replace("\n\n\n", "\n\n\n\n# Again.\n"))
+
+    assert changed_by(copy, change) == []
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "same"),
+    [
+        ("raise ValueError('one')", "raise ValueError(f'two {3}')", True),
+        ("assert x, 'one'", "assert x, 'two'", True),
+        ("def f():\n  'one'\n  return 1", "def f():\n  'two'\n  return 1", True),
+        ("assert x, 'one'", "assert y, 'one'", False),
+        ("def f():\n  return 'one'", "def f():\n  return 'two'", False),
+        ("if x < 1:\n  raise E()", "if x < 2:\n  raise E()", False),
+        ("x = f(1.0)", "x = f(1)", False),
+        ("x = a and b", "x = a or b", False),
+        ("x = [1, 2]", "x = [2, 1]", False),
+        ("x = [[1], 2]", "x = [[1, 2]]", False),
+        ("class A(B): pass", "class A: B", False),
+        ("x: float = 1", "x: int = 1", False),
+    ],
+)
+def test_what_a_file_does_counts_and_what_it_says_does_not(before, after, same):
+    hashes = [source_hashes.hash_code(text.encode()) for text in (before, after)]
+    assert (hashes[0] == hashes[1]) == same
 
 
 def test_a_new_room_and_a_new_folder_in_a_room_count_by_themselves(copy):
@@ -66,16 +122,30 @@ def test_a_new_room_and_a_new_folder_in_a_room_count_by_themselves(copy):
             place.parent.mkdir(parents=True)
             place.write_text("")
 
-    assert changed_by(copy, add) == [
-        "source.purerl.planner.search",
-        "source.purerl.ppo.more.deep.losses",
-    ]
+    assert changed_by(copy, add) == ["purerl.planner.search", "purerl.ppo.more.deep.losses"]
 
 
-def test_commands_do_not_count_and_the_front_door_does(copy):
-    for command in ("run", "evaluate", "render", "compare"):
+def test_commands_do_not_count(copy):
+    for command in ("run", "evaluate", "render", "compare", "__init__"):
         assert changed_by(copy, lambda name=command: edit(copy / f"{name}.py")) == []
-    assert changed_by(copy, lambda: edit(copy / "__init__.py")) == ["source.purerl"]
+
+
+def test_what_is_left_out_is_no_part_of_what_is_traced():
+    """Programs are traced from modules that compute; the few left out there only raise errors."""
+    counted = set(source_hashes.package_files(source_hashes.PACKAGE))
+    for name in sorted(set().union(*(own(MODULES[n]) for n in counted)) - counted):
+        room = name.split(".")[1]
+        assert name.removeprefix("purerl.") in source_hashes.LEFT_OUT, f"{room} is imported"
+        tree = ast.parse(MODULES[name].read_text())
+        public = [n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name[0] != "_"]
+        returned = {ast.unparse(one.returns) for one in public if one.returns}
+        assert returned <= {"None", "str"}, f"{name} hands on {returned}"
+
+
+def test_what_is_left_out_is_there():
+    for name in source_hashes.LEFT_OUT | source_hashes.IMPORTED:
+        place = source_hashes.PACKAGE / name.replace(".", "/")
+        assert place.is_dir() or place.with_suffix(".py").is_file()
 
 
 def test_the_files_hashed_are_those_that_python_runs(monkeypatch):
@@ -83,7 +153,7 @@ def test_the_files_hashed_are_those_that_python_runs(monkeypatch):
     monkeypatch.setattr(purerl, "__path__", [str(ROOT.parent)])
     monkeypatch.setattr(purerl, "__file__", None)
     hashed = source_hashes.package_files(source_hashes.PACKAGE)
-    for module in (compilation, losses, run_folder):
+    for module in (compilation, losses):
         assert hashed[module.__name__] == Path(module.__file__)
 
 
@@ -95,23 +165,44 @@ def resume(copy: Path, runs: Path) -> subprocess.CompletedProcess:
     )
 
 
-def test_an_edited_package_refuses_to_resume_and_names_what_was_edited(copy, tmp_path):
+def test_what_moves_no_bit_keeps_nobody_from_resuming_and_what_does_is_named(copy, tmp_path):
     runs = tmp_path / "runs"
     assert run.main([str(TOY), "--runs", str(runs)]) == SUCCESS
+    digest = Run(runs / "toy_experiment" / "seed1").digest
+    for room in COMPUTING:  # a docstring, a comment
+        for file in (copy / room).glob("*.py"):
+            edit(file, COMMENT)
+    config = copy / "ppo" / "checks.py"
+    message = "it must be {rule}"
+    assert message in config.read_text()
+    config.write_text(config.read_text().replace(message, "it has to be {rule}"))
+    for file in ("checks/check_env.py", "machine/output.py", "runs/resume.py", "compare.py"):
+        edit(copy / file)  # a check, what prints, what resumes, a command
     edit(copy / "report" / "run_reader.py")
-    edit(copy / "tune" / "sweep" / "scheduler.py")
-    edit(copy / "compare.py")
     done = resume(copy, runs)
     assert (done.returncode, done.stderr) == (SUCCESS, ""), done.stderr
-    assert "Already done" in done.stdout
-    edited = {room: modules(copy / room)[0] for room in ROOMS if room not in LOOKING}
-    for file in edited.values():
-        edit(file)
+    assert f"Already done: 12 updates. Digest {digest}" in done.stdout
+    named = []
+    for room in COMPUTING:
+        counted = sorted(source_hashes.package_files(copy).items())
+        files = [(n, f) for n, f in counted if n.split(".")[1] == room and f.stem != "__init__"]
+        named += [f"source.{next(n for n, f in files if change_operator(f))}"]
     done = resume(copy, runs)
     assert done.returncode == USAGE and "begun under other conditions" in done.stderr
     assert "Put back what was edited, train anew" in done.stderr
-    named = [line.split(":")[0].strip() for line in done.stderr.splitlines() if "->" in line]
-    assert named == [f"source.purerl.{room}.{file.stem}" for room, file in edited.items()]
+    said = [line.split(":")[0].strip() for line in done.stderr.splitlines() if "->" in line]
+    assert said == named
+
+
+def test_a_comment_in_an_experiment_keeps_nobody_from_resuming(tmp_path, capsys):
+    file, runs = tmp_path / "mine.py", tmp_path / "runs"
+    file.write_text(TOY.read_text())
+    assert run.main([str(file), "--runs", str(runs)]) == SUCCESS
+    edit(file, COMMENT)
+    assert run.main([str(file), "--runs", str(runs), "--resume"]) == SUCCESS
+    edit(file)
+    assert run.main([str(file), "--runs", str(runs), "--resume"]) == USAGE
+    assert "experiment.py: " in capsys.readouterr().err
 
 
 def test_the_manifest_of_a_run_holds_every_room_that_computes(tmp_path):
@@ -119,8 +210,8 @@ def test_the_manifest_of_a_run_holds_every_room_that_computes(tmp_path):
     file = tmp_path / "toy_experiment" / "seed1" / "manifest.json"
     found = json.loads(file.read_text())["source"]
     counted = {name.split(".")[1] for name in found if name.startswith("purerl.")}
-    assert counted == set(ROOMS) - LOOKING
-    assert {"tests.ppo.probes", "tests", "purerl"} <= set(found)  # the builders' imports too
+    assert counted == set(COMPUTING)
+    assert {"tests.ppo.probes", "tests"} <= set(found)  # the builders' imports too
 
 
 # --- what the builders import ---

@@ -19,10 +19,12 @@ import purerl
 from purerl import compare, evaluate, record, render, run
 from purerl.core.errors import USAGE
 from purerl.exact import xla_flags
-from purerl.runs import training
-from purerl.runs.command_line import from_settings
-from purerl.runs.experiment import Experiment, Source, from_json, settings as settings_of, to_json
-from purerl.runs.options import Options
+from purerl.experiment.command_line import from_settings
+from purerl.experiment.definition import Experiment
+from purerl.experiment.loading import Source
+from purerl.experiment.options import RunOptions
+from purerl.experiment.settings_json import from_json, settings_of, to_json
+from purerl.training import train
 from tests.runs import toy_experiment
 
 TOY = Path(__file__).parent / "toy_experiment.py"
@@ -100,7 +102,7 @@ def test_a_run_that_was_stopped_goes_on(trained, tmp_path, monkeypatch):
     asked = iter([False, False, True])
     stop = lambda _: contextlib.nullcontext(lambda: next(asked, True))  # noqa: E731
     with monkeypatch.context() as patch:
-        patch.setattr(training, "stop_signals", stop)
+        patch.setattr(train, "stop_signals", stop)
         with pytest.raises(purerl.StoppedError, match="it is saved"):
             purerl.train(str(TOY), SETTINGS, runs=tmp_path)
     run_ = purerl.train(str(TOY), SETTINGS, runs=tmp_path, resume=True)
@@ -193,7 +195,7 @@ def named(env: Kinds) -> dict:
 @given(KINDS)
 def test_settings_by_name_are_the_settings(env):
     chosen, options = from_settings(Source(BASE, "kinds", TOY), named(env), {"num_seeds": 2})
-    assert chosen == dataclasses.replace(BASE, env=env) and options == Options(num_seeds=2)
+    assert chosen == dataclasses.replace(BASE, env=env) and options == RunOptions(num_seeds=2)
     assert isinstance(chosen.env.size, float)
 
 
@@ -222,18 +224,18 @@ def test_a_video_is_the_commands(tmp_path):
 )
 def test_flags_that_come_too_late_for_a_gpu_are_not_claimed(monkeypatch, capsys, flags, said):
     monkeypatch.setenv("XLA_FLAGS", flags)
-    monkeypatch.setattr(training, "_runs_on_gpu", lambda: True)
-    training.set_xla_flags_in_time()
+    monkeypatch.setattr(train, "_runs_on_gpu", lambda: True)
+    train.set_xla_flags_in_time()
     assert ("not bit-exact" in capsys.readouterr().out) == said
     assert (xla_flags.how_chosen("gpu") == "by timing") == said
-    monkeypatch.setattr(training, "_runs_on_gpu", lambda: False)
-    training.set_xla_flags_in_time()
+    monkeypatch.setattr(train, "_runs_on_gpu", lambda: False)
+    train.set_xla_flags_in_time()
     assert xla_flags.how_chosen("gpu") == "fixed" and not capsys.readouterr().out
 
 
 def test_a_second_signal_interrupts_and_the_handlers_come_back(capsys):
     before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt), training.stop_signals(training._interrupt) as stop:
+    with pytest.raises(KeyboardInterrupt), train.stop_signals(train._interrupt) as stop:
         os.kill(os.getpid(), signal.SIGTERM)
         assert stop()
         os.kill(os.getpid(), signal.SIGTERM)
@@ -274,5 +276,5 @@ def test_a_run_from_before_the_move_is_one_line(trained, tmp_path, capsys):
 
 def test_types_of_settings_have_no_name_of_an_option():
     names = {field.name for field in dataclasses.fields(Experiment)}
-    assert not names & {field.name for field in dataclasses.fields(Options)}
+    assert not names & {field.name for field in dataclasses.fields(RunOptions)}
     assert "seed" in settings_of(BASE)

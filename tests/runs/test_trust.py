@@ -12,7 +12,7 @@ import pytest
 import purerl
 from purerl import compare, evaluate, record, render, run
 from purerl.core.errors import SUCCESS, USAGE
-from purerl.runs import trust
+from purerl.experiment import trust
 from tests.runs.test_foreign_files import (  # noqa: F401
     FEW,
     TOY,

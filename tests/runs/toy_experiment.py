@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
+from purerl.experiment.definition import Experiment
 from purerl.ppo.config import Config, Evaluation
 from purerl.ppo.networks import MlpOptions, mlp
-from purerl.runs.experiment import Experiment
 from tests.ppo.probes import Probe
 
 

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import jax
 
+from purerl.checks.user_code import users_errors
 from purerl.core.errors import StoppedError
-from purerl.runs import output
-from purerl.runs.build_experiment import blame
-from purerl.runs.user_code import told
+from purerl.experiment.objects import naming_broken_rules
+from purerl.machine import output
 from purerl.tune.plan import episodes, figures, planner
 from purerl.tune.plan.filming import film, keep_observation, keep_picture
 
@@ -49,7 +49,7 @@ def play(problem: Any, options: Any, judges: dict[str, Any], stop: Callable[[], 
     game = (config, options, env, guide, problem.learned, options.seed, options.episodes)
     rows: list[Any] = []
     begin = spoke = time.perf_counter()
-    with told(""), blame(env):
+    with users_errors(""), naming_broken_rules(env):
         for now, computed in episodes.episodes(*game, judges, keep):
             wait(computed)
             rows.append(jax.device_get(computed))

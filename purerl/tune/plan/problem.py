@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import UserError
-from purerl.runs.build_experiment import Setup, build
-from purerl.runs.experiment import Experiment, to_json
+from purerl.experiment.definition import Experiment
+from purerl.experiment.objects import Setup, build
+from purerl.experiment.settings_json import to_json
 from purerl.tune import subject
 from purerl.tune.overrides import environment_words
 from purerl.tune.subject import PlanOptions, Subject
@@ -19,7 +20,7 @@ BOTH = ("first", "second")  # the settings before it, and after it
 
 
 @dataclass(frozen=True)
-class Options(PlanOptions):
+class PlanCommandOptions(PlanOptions):
     """What is planned, and what becomes of it."""
 
     episodes: int = 1
@@ -75,7 +76,7 @@ class Problem(NamedTuple):
     trained: str  # what of a run that is, in words
 
 
-def read(words: Sequence[str], prog: str) -> tuple[Problem, Problem | None, Options]:
+def read(words: Sequence[str], prog: str) -> tuple[Problem, Problem | None, PlanCommandOptions]:
     """Reads a command line: what is planned for, and under which other settings too.
 
     Args:
@@ -92,7 +93,7 @@ def read(words: Sequence[str], prog: str) -> tuple[Problem, Problem | None, Opti
         words, after = words[:place], words[place + 1 :]
     found = subject.find(words, prog)
     prog = f"{prog} {found.name}"
-    chosen, options = subject.chosen(found, words[1:], prog, Options)
+    chosen, options = subject.chosen(found, words[1:], prog, PlanCommandOptions)
     if found.run is None and options.no_policy:
         raise UserError(f"{found.name} is an experiment: --no-policy is for a run's folder.")
     first = _problem(found, chosen, options)
@@ -111,7 +112,7 @@ def read(words: Sequence[str], prog: str) -> tuple[Problem, Problem | None, Opti
     return first, second, options
 
 
-def _problem(found: Subject, chosen: Experiment, options: Options) -> Problem:
+def _problem(found: Subject, chosen: Experiment, options: PlanCommandOptions) -> Problem:
     run = None if options.no_policy else found.run
     written = found.source if found.run is None else found.run.restored.source
     return Problem(
@@ -132,7 +133,7 @@ def _check_after(after: Sequence[str], found: Subject, prog: str) -> None:
             f"Nothing stands after {AGAINST}: give other settings of the environment "
             f"({_example(found.source.experiment.env)})."
         )
-    mine = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(Options)}
+    mine = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(PlanCommandOptions)}
     wrong = next((word for word in after if word.split("=")[0] in mine | {"--engine"}), None)
     if wrong:
         raise UserError(

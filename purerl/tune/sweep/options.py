@@ -11,10 +11,10 @@ from typing import Annotated, Any
 import tyro
 
 from purerl.core.errors import UserError, nearest, one_line, unknown_name
-from purerl.runs import command_line
-from purerl.runs.experiment import find_source
-from purerl.runs.files import check_name, read_bytes
-from purerl.runs.options import Options as RunOptions
+from purerl.experiment import command_line
+from purerl.experiment.loading import find_source
+from purerl.experiment.options import RunOptions
+from purerl.machine.files import check_name, read_bytes
 from purerl.tune.sweep import points
 from purerl.tune.sweep.points import Base
 
@@ -30,7 +30,7 @@ NOT_HERE = {
 
 
 @dataclass(frozen=True)
-class Options:
+class SweepOptions:
     """Trains an experiment with many settings: EXPERIMENT [options] [settings as `run` takes].
 
     Instead of EXPERIMENT a file SWEEP.toml may stand, which has all of it. The settings are listed
@@ -63,11 +63,11 @@ class Options:
     """Check everything, print the commands, and start none."""
 
 
-OWN = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(Options)}
+OWN = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(SweepOptions)}
 SEVERAL = ("--grid", "--over")
 
 
-def read(arguments: Sequence[str]) -> tuple[Options, Base, list[str]]:
+def read(arguments: Sequence[str]) -> tuple[SweepOptions, Base, list[str]]:
     """Reads a whole command line.
 
     Returns:
@@ -84,7 +84,7 @@ def read(arguments: Sequence[str]) -> tuple[Options, Base, list[str]]:
         raise UserError(f"The first word must be the experiment or a .toml file: {PROG} EXPERIMENT")
     named, *words = words
     own, rest = split(words)
-    options = command_line.parse(Options, own, PROG)
+    options = command_line.parse(SweepOptions, own, PROG)
     if options.name:
         check_name("name", options.name)
     source = find_source(named)
@@ -104,7 +104,7 @@ def read(arguments: Sequence[str]) -> tuple[Options, Base, list[str]]:
     return options, base._replace(chosen=chosen, words=tuple(rest), options=of_run), given
 
 
-def check(options: Options) -> None:
+def check(options: SweepOptions) -> None:
     """Raises UserError unless the options go together."""
     ways = [name for name in ("grid", "random", "optuna") if getattr(options, name)]
     if len(ways) > 1:

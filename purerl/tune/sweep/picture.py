@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from purerl.core.errors import UserError
+from purerl.machine.output import printable
 from purerl.report.comparison import plotter
-from purerl.runs.output import printable
 from purerl.tune.sweep.spaces import Space
 from purerl.tune.sweep.table import Row, by_value, is_number
 

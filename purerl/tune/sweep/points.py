@@ -9,11 +9,12 @@ from typing import Annotated, Any, NamedTuple
 import tyro
 
 from purerl.core.errors import UserError, one_line
-from purerl.runs import experiment, others_words
-from purerl.runs.command_line import WORDS, parse
-from purerl.runs.experiment import Experiment, Source
-from purerl.runs.kinds import hints
-from purerl.runs.options import Options
+from purerl.experiment import other_trainers, settings_json
+from purerl.experiment.command_line import WORDS, parse
+from purerl.experiment.definition import Experiment
+from purerl.experiment.kinds import hints
+from purerl.experiment.loading import Source
+from purerl.experiment.options import RunOptions
 from purerl.tune.sweep.scheduler import Job
 from purerl.tune.sweep.spaces import Space, Values, parse_space
 
@@ -39,7 +40,7 @@ class Base(NamedTuple):
     words: tuple[str, ...]  # of the run command, those of the points excepted
     seeds: int
     folder: Path  # of the sweep
-    options: Options  # of each run, as the words give them
+    options: RunOptions  # of each run, as the words give them
 
     @property
     def name(self) -> str:
@@ -83,7 +84,7 @@ def setting(base: Base, name: str) -> Any:
         raise UserError("Each point is trained with several seeds already: give --seeds 3.")
     names = _names(base.chosen)
     if name not in names:
-        hint = others_words.meant(name, names)
+        hint = other_trainers.suggest(name, names)
         said = f"There is no setting {name!r}. {hint}".strip()
         page = f"python -m purerl.run {base.experiment} --help"
         raise UserError(f"{said} All settings: {page}")
@@ -93,7 +94,7 @@ def setting(base: Base, name: str) -> Any:
 def _names(value: Any, path: str = "") -> dict[str, Any]:
     """Returns the settings of an experiment, `ppo.learning-rate` -> value."""
     found: dict[str, Any] = {}
-    for name, inner in experiment.settings(value).items():
+    for name, inner in settings_json.settings_of(value).items():
         name = path + name.replace("_", "-")
         is_settings = dataclasses.is_dataclass(inner) and not isinstance(inner, type)
         found |= _names(inner, f"{name}.") if is_settings else {name: inner}
@@ -174,7 +175,7 @@ def _replace(value: Any, tree: Mapping[str, Any]) -> Any:
 
 def option_words(base: Base, name: str, text: str) -> list[str]:
     """Returns a setting with its value, as words of the run command: a flag has no value."""
-    default = _names(base.chosen).get(name, getattr(Options, name.replace("-", "_"), None))
+    default = _names(base.chosen).get(name, getattr(RunOptions, name.replace("-", "_"), None))
     if not isinstance(default, bool):
         return [f"--{name}", *text.split()]
     if (_bool_word(name, text) == "True") == default:

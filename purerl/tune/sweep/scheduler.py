@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import INTERRUPTED, SUCCESS, UserError
+from purerl.machine.files import make_folder
+from purerl.machine.lock import FolderLock
+from purerl.machine.output import printable, warn
 from purerl.report import run_reader
 from purerl.runs import checkpoint_folder
-from purerl.runs.files import make_folder
-from purerl.runs.lock import RunLock
-from purerl.runs.output import printable, warn
-from purerl.runs.run_folder import is_begun
+from purerl.runs.folder import CHECKPOINTS, read
 
 POLL = 0.2  # [s]
 TAIL = 1 << 16  # [bytes] of a log in which its last line is looked for
@@ -66,7 +66,7 @@ def _has_ended(folder: Path) -> bool:
         planned = run_reader.read(folder).planned
     except UserError:  # not begun, or half written: the run itself says what is wrong with it
         return False
-    return planned is not None and planned in checkpoint_folder.updates(folder / "checkpoints")
+    return planned is not None and planned in checkpoint_folder.updates(folder / CHECKPOINTS)
 
 
 def is_locked(job: Job) -> bool:
@@ -74,7 +74,7 @@ def is_locked(job: Job) -> bool:
     for folder in job.folders:
         if folder.is_dir():
             try:
-                RunLock(folder, patience=0.0).close()
+                FolderLock(folder, patience=0.0).close()
             except UserError:
                 return True
             except OSError:  # the run itself will say what is wrong with it
@@ -170,7 +170,7 @@ def start(job: Job, more: Mapping[str, str], before: tuple[str, ...] = ()) -> su
     """
     words = [*RUN, *job.words]
     with contextlib.suppress(UserError):  # a broken manifest: the run will say so
-        words += ["--resume"] if any(map(is_begun, job.folders)) else []
+        words += ["--resume"] if any(read(folder).is_begun for folder in job.folders) else []
     make_folder(job.log.parent)
     with job.log.open("ab") as log:
         log.write(f"$ python {' '.join(words)}\n".encode())

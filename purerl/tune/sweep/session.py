@@ -8,15 +8,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, UserError
-from purerl.runs import manifest
-from purerl.runs.experiment import Source, to_json
-from purerl.runs.files import check_object, make_folder, read_json, write_json
-from purerl.runs.lock import RunLock
-from purerl.runs.output import say, show, warn
-from purerl.runs.run_folder import is_begun
-from purerl.runs.source_hashes import PACKAGE, source_hashes
+from purerl.experiment.loading import Source
+from purerl.experiment.settings_json import to_json
+from purerl.experiment.source_hashes import PACKAGE, source_hashes
+from purerl.machine.files import check_object, make_folder, read_json, write_json
+from purerl.machine.lock import FolderLock
+from purerl.machine.output import say, show, warn
+from purerl.runs import folder as run_folder, manifest
 from purerl.tune.sweep import picture, points, scheduler, slurm, spaces, study, table
-from purerl.tune.sweep.options import Options, read
+from purerl.tune.sweep.options import SweepOptions, read
 from purerl.tune.sweep.points import Base, Point
 from purerl.tune.sweep.scheduler import Ended, Job
 from purerl.tune.sweep.spaces import Space
@@ -25,7 +25,7 @@ from purerl.tune.sweep.spaces import Space
 class Sweep(NamedTuple):
     """A sweep that has been checked."""
 
-    options: Options
+    options: SweepOptions
     base: Base
     spaces: list[Space]
     points: list[Point]  # empty if Optuna chooses them
@@ -92,9 +92,9 @@ def _begin(sweep: Sweep) -> Iterator[None]:
         lock.close()
 
 
-def _lock(folder: Path) -> RunLock:
+def _lock(folder: Path) -> FolderLock:
     try:
-        return RunLock(folder)
+        return FolderLock(folder)
     except UserError as error:
         raise UserError(
             f"The sweep {folder} is being carried out by another process; stop that one first, or "
@@ -121,7 +121,7 @@ def _check_code(base: Base, begun: dict[str, Any], now: dict[str, str]) -> None:
     changed = [name for name in begun if now.get(name, begun[name]) != begun[name]]
     if not changed or base.options.allow_changes:
         return
-    if any(map(is_begun, (base.folder / base.name).glob("*"))):
+    if any(run_folder.read(folder).is_begun for folder in (base.folder / base.name).glob("*")):
         more = f" and {len(changed) - 1} more" if changed[1:] else ""
         raise UserError(
             f"The experiment's code has changed since the sweep {base.folder} began: {changed[0]}"

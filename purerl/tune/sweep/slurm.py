@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import INTERRUPTED, UserError, one_line
-from purerl.runs.files import read_json, write_json
+from purerl.machine.files import read_json, write_json
 from purerl.tune.sweep.scheduler import POLL, Job, end, is_done, is_locked, start
 
 FOLDER, IDS = "slurm", "jobs.json"

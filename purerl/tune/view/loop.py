@@ -7,8 +7,8 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
+from purerl.checks.user_code import program_errors
 from purerl.core.errors import RunError, UserError, one_line
-from purerl.runs.user_code import running
 from purerl.tune.view import session as events
 from purerl.tune.view.opening import Source
 from purerl.tune.view.option_numbers import label
@@ -157,7 +157,7 @@ def _advance(session: Session, happened: list[Any]) -> tuple[Session, bool]:
     """Returns the session after the events, and whether something failed."""
     failed = any(isinstance(event, events.Failed) for event in happened)
     try:
-        with running():
+        with program_errors():
             return advance(session, happened), failed
     except (RunError, UserError) as error:  # a function of the environment raised
         return session._replace(playing=False, trouble=str(error), grip=None), failed

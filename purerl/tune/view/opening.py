@@ -10,11 +10,13 @@ import jax
 from purerl.core.errors import UserError, one_line
 from purerl.core.records import TrainState
 from purerl.devices.compilation import set_up_jax
-from purerl.runs import checkpoint_folder, experiment, files
-from purerl.runs.build_experiment import Setup, build
-from purerl.runs.experiment import Experiment
+from purerl.experiment import loading
+from purerl.experiment.definition import Experiment
+from purerl.experiment.objects import Setup, build
+from purerl.machine.output import show
+from purerl.runs import checkpoint_folder
+from purerl.runs.folder import CHECKPOINTS, CODE
 from purerl.runs.loaded_run import Run
-from purerl.runs.output import show
 from purerl.runs.restored_run import read_checkpoint
 from purerl.tune import overrides
 from purerl.tune.plan import planner
@@ -149,7 +151,7 @@ def _plans(options: Any) -> str:
 def checkpoint_names(folder: Path, first: str) -> list[str]:
     """Returns the checkpoints that can be chosen now, the newest first after `first`."""
     try:
-        updates = checkpoint_folder.updates(folder / "checkpoints")
+        updates = checkpoint_folder.updates(folder / CHECKPOINTS)
     except OSError:  # it may be moved, or a disk away for a moment
         updates = []
     return list(dict.fromkeys([first, "latest", "best", *map(str, reversed(updates))]))
@@ -157,8 +159,8 @@ def checkpoint_names(folder: Path, first: str) -> list[str]:
 
 def command_name(run: Run) -> str:
     """Returns what `python -m purerl.run` knows the run's experiment by."""
-    name = files.read_json(run.folder / "config.json")["experiment"]
-    if name in experiment.available():
+    name = run.restored.source.name
+    if name in loading.available():
         return name
-    place = Path(files.read_json(run.folder / "manifest.json").get("experiment_file", ""))
-    return str(place if place.is_file() else run.folder / "experiment.py")
+    place = Path(run.restored.folder.manifest.get("experiment_file", ""))
+    return str(place if place.is_file() else run.folder / CODE)

@@ -6,8 +6,8 @@ import pytest
 
 from purerl import run, sweep
 from purerl.core.errors import SUCCESS, USAGE
-from purerl.runs.command_line import from_command_line
-from purerl.runs.experiment import find_source
+from purerl.experiment.command_line import from_command_line
+from purerl.experiment.loading import find_source
 from tests.runs.test_run import TOY
 
 FILE = f"""

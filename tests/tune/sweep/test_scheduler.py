@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from purerl.runs.lock import RunLock
+from purerl.machine.lock import FolderLock
 from purerl.tune.sweep import scheduler
 from purerl.tune.sweep.scheduler import Job, environment_of, find_gpus, jobs_at_once
 from tests.runs.test_run import ROOT
@@ -72,8 +72,8 @@ def test_a_signal_saves_all_runs_and_they_are_resumed(place, number):
 @pytest.mark.slow
 def test_a_run_that_outlived_its_scheduler_is_waited_for(place):
     one = job("a")
-    holds = f"import sys; from purerl.runs.lock import RunLock; from pathlib import Path\n\
-locks = [RunLock(Path(p)) for p in {list(map(str, one.folders))}]\nprint('held', flush=True)\n\
+    holds = f"import sys; from purerl.machine.lock import FolderLock; from pathlib import Path\n\
+locks = [FolderLock(Path(p)) for p in {list(map(str, one.folders))}]\nprint('held', flush=True)\n\
 sys.stdin.read()"
     other = subprocess.Popen(
         [sys.executable, "-c", holds], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
@@ -157,7 +157,7 @@ def test_the_lock_that_a_look_takes_is_given_back(place):
     one = job("a")
     one.folders[0].mkdir(parents=True)
     assert not scheduler.is_locked(one)
-    lock = RunLock(one.folders[0])
+    lock = FolderLock(one.folders[0])
     assert scheduler.is_locked(one)
     lock.close()
     assert not scheduler.is_locked(one)

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from purerl.runs.experiment import find_source
-from purerl.runs.options import Options
+from purerl.experiment.loading import find_source
+from purerl.experiment.options import RunOptions
 from purerl.tune.sweep import picture, table
 from purerl.tune.sweep.points import Base, Point
 from purerl.tune.sweep.spaces import parse_space
@@ -68,7 +68,7 @@ def test_digits_are_few_and_what_has_no_run_brings_no_note():
 
 def test_a_point_that_has_not_begun_waits(tmp_path):
     source = find_source(str(TOY))
-    base = Base(str(TOY), source, source.experiment, (), 2, Path(tmp_path), Options())
+    base = Base(str(TOY), source, source.experiment, (), 2, Path(tmp_path), RunOptions())
     (found,) = table.make_rows(base, [Point(0, {"ppo.gamma": "0.9"})], "eval/episode_return")
     assert (found.status, found.typed) == ("waiting", {"ppo.gamma": 0.9})
     said = table.describe([found], [parse_space("ppo.gamma", "0.9", False)], "eval/x")

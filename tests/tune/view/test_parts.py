@@ -10,9 +10,9 @@ import pytest
 
 from purerl import UserError
 from purerl.envs import run
+from purerl.experiment.command_line import from_command_line
+from purerl.experiment.loading import find_source
 from purerl.report.episode_pictures import Picture
-from purerl.runs.command_line import from_command_line
-from purerl.runs.experiment import find_source
 from purerl.tune import overrides
 from purerl.tune.view import loop, opening, push, shapes
 from purerl.tune.view.option_numbers import bounds, label, numbers_of, replaced

@@ -46,7 +46,7 @@ def trained(tmp_path_factory) -> Path:
 
 def open_with(options, name: Path, *words: str):
     found = subject.find([str(name)], view.PROG)
-    chosen, _ = subject.chosen(found, words, view.PROG, view.Options)
+    chosen, _ = subject.chosen(found, words, view.PROG, view.ViewOptions)
     return opening.open_window(found, chosen, options)
 
 
@@ -122,7 +122,7 @@ def test_an_environment_without_options_has_no_sliders(made):
 @pytest.mark.slow
 def test_the_planner_drives_an_experiment(trained):
     """By the best of its plans: to be still at x = 0 costs least, and a push is braked."""
-    options = view.Options(samples=32, horizon=10, seed=1)
+    options = view.ViewOptions(samples=32, horizon=10, seed=1)
     session, source, title = open_with(options, Path(sled.__file__))
     assert title == "sled_experiment" and source.checkpoints() == ()
     session = advance(session, [Push((1.0, 0.0, 0.0)), Step()])
@@ -132,7 +132,7 @@ def test_the_planner_drives_an_experiment(trained):
     assert speeds[0] > 0.9 and speeds[-1] < 0.5 * speeds[0]
     assert all(row.action[0] < 0 for row in session.rows[:5])
     # Of a run, plans begin with what the policy does.
-    of_run = view.Options(drive="planner", samples=8, horizon=2)
+    of_run = view.ViewOptions(drive="planner", samples=8, horizon=2)
     session, source, _ = open_with(of_run, trained)
     assert take_step(session).length == 1
     assert source.command({("bonus",): 2.0}).endswith("sled_experiment.py --env.bonus 2.0")
@@ -146,7 +146,7 @@ def test_the_planner_drives_an_experiment(trained):
 @pytest.mark.parametrize("of", ["experiment", "run"])
 def test_the_sliders_begin_where_the_command_line_puts_them(trained, of):
     name = trained if of == "run" else Path(sled.__file__)
-    options = view.Options(samples=8, horizon=2)
+    options = view.ViewOptions(samples=8, horizon=2)
     session, source, _ = open_with(options, name, "--env.bonus", "3", "--env.width", "0.25")
     assert session.numbers[("bonus",)] == 3.0 and session.numbers[("width",)] == 0.25
     assert take_step(session).rows[-1].metrics["reward_bonus"] == 3.0

@@ -1,0 +1,188 @@
+"""Command lines from dataclasses, by tyro, with one-line errors."""
+
+import contextlib
+import dataclasses
+import enum
+import io
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import tyro
+
+from purerl.core.errors import SUCCESS, RunError, UserError, nearest
+from purerl.experiment import other_trainers, settings_json
+from purerl.experiment.definition import Experiment
+from purerl.experiment.loading import Source, available, summary
+from purerl.experiment.options import RunOptions
+from purerl.machine import output
+from purerl.machine.command_errors import tell
+
+CONFIG = (tyro.conf.FlagCreatePairsOff,)
+# A flag takes a word, True or False, as every other option does.
+WORDS = (tyro.conf.FlagConversionOff,)
+
+
+def carry_out(
+    kind: Any, command: Callable[[Any], int | None], prog: str, arguments: Sequence[str] | None
+) -> int:
+    """Runs a command with its options; returns the exit code, an error being told in one line.
+
+    Args:
+      kind: the dataclass of its options.
+      command: called with them; what it returns is the exit code, None: 0.
+      prog: the command's words, for the help page.
+      arguments: the command line; None: this process's.
+    """
+    try:
+        words = sys.argv[1:] if arguments is None else arguments
+        return command(parse(kind, words, prog)) or SUCCESS
+    except (UserError, RunError) as error:
+        return tell(error)
+
+
+def from_command_line(
+    source: Source,
+    arguments: Sequence[str],
+    prog: str,
+    config: Any = CONFIG,
+    base: Any = RunOptions,
+    names: Sequence[str] = (),
+) -> tuple[Experiment, Any]:
+    """Returns the experiment with its overrides, and the command's options.
+
+    Args:
+      source: the experiment.
+      arguments: the command line after the experiment's name.
+      prog: the command before `arguments`, for the help page and for errors.
+      config: tyro's markers.
+      base: the dataclass of the command's options.
+      names: of the experiment's settings that can be overridden; none: all.
+
+    Raises:
+      UserError: there is no such option, or a value is wrong.
+    """
+    values = settings_json.settings_of(source.experiment)
+    values = {name: values[name] for name in names or values}
+    kinds = {f.name: f.type for f in dataclasses.fields(Experiment)}
+    kinds |= {name: type(v) for name, v in values.items() if dataclasses.is_dataclass(v)}
+    # A class made for this experiment: its settings have the types of their values, which is all
+    # that the command line needs to know, so an environment's options need no registration.
+    fields = [(name, kinds[name], dataclasses.field(kw_only=True)) for name in values]
+    both = dataclasses.make_dataclass("Settings", fields, bases=(base,), frozen=True)
+    both.__doc__ = summary(source.path) or f"Trains {source.name}."
+    parsed = parse(both, arguments, prog, both(**values), config)
+    overrides = {name: getattr(parsed, name) for name in values}
+    options = {f.name: getattr(parsed, f.name) for f in dataclasses.fields(base)}
+    return dataclasses.replace(source.experiment, **overrides), base(**options)
+
+
+def from_settings(
+    source: Source, settings: Mapping[str, Any], options: Mapping[str, Any]
+) -> tuple[Experiment, RunOptions]:
+    """Returns the same as `from_command_line`, checked in the same way, from Python values.
+
+    Args:
+      source: the experiment.
+      settings: "ppo.num_envs" -> value.
+      options: "num_seeds" -> value.
+    """
+    if not isinstance(settings, Mapping):
+        raise UserError(f"settings is {settings!r}; give a dict, such as {{'ppo.gamma': 0.99}}.")
+    for name, value in settings.items():
+        held = getattr(source.experiment, name, None)
+        if isinstance(value, Mapping) and dataclasses.is_dataclass(held):
+            dotted = {f"{name}.{inner}": one for inner, one in value.items()}
+            raise UserError(f"Settings of {name} have dotted names: give {dotted}.")
+    words = [word for pair in {**settings, **options}.items() for word in _words(*pair)]
+    known = source.name if source.name in available() else source.path
+    return from_command_line(source, words, f"python -m purerl.run {known}", WORDS)
+
+
+def _words(name: str, value: Any) -> list[str]:
+    """Returns an option of the command line with its value."""
+    if isinstance(value, Mapping):
+        value = [part for pair in value.items() for part in pair]
+    parts = value if isinstance(value, list | tuple) else [value]
+    texts = [part.name if isinstance(part, enum.Enum) else str(part) for part in parts]
+    return [f"--{name.replace('_', '-')}", *texts]
+
+
+def parse(
+    kind: Any, arguments: Sequence[str], prog: str, default: Any = None, config: Any = CONFIG
+) -> Any:
+    """Parses a command line into the dataclass `kind`; `--help` prints a page and exits.
+
+    Raises:
+      UserError: there is no such option (the message has the nearest one), or a value is wrong.
+    """
+    said = io.StringIO()
+    extra = {} if default is None else {"default": default}
+    try:
+        with output.answering(), contextlib.redirect_stderr(said):
+            return tyro.cli(kind, args=list(arguments), prog=prog, config=config, **extra)
+    except SystemExit as error:
+        if not error.code:
+            raise
+        what = _one_line(said.getvalue(), _option_names(kind, default))
+        raise UserError(f"{what} All options: {prog} --help") from error
+
+
+def _one_line(text: str, names: list[str]) -> str:
+    """Returns tyro's framed, coloured message as one line: what is wrong, and the nearest fix."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", text)
+    plain = " ".join(re.sub(r"[─-╿]|-{5,}", " ", text).split())
+    unknown = re.search(r"Unrecognized options: (\S+?)[,=]? ", plain)
+    if unknown:
+        if unknown[1] in ("True", "False"):
+            return "A switch takes no value: give its option alone, or leave it out."
+        if unknown[1] in names:  # a bool that is true: what turns it off is its only option
+            group, dot, name = unknown[1][2:].rpartition(".")
+            return f"{unknown[1]} takes no value; --{group}{dot}no-{name} turns it off."
+        if not unknown[1].startswith("-"):
+            return f"{unknown[1]!r} follows no option; write one before it, as in --name x."
+        return (
+            f"There is no option {unknown[1]}. {other_trainers.suggest(unknown[1], names)}".strip()
+        )
+    titles = "Value error|Missing argument|Invalid choice|Parsing error|Required options"
+    plain = re.sub(rf"^({titles}) ", "", plain)
+    plain = re.sub(r" *(Argument helptext:|For full helptext).*", "", plain)
+    for pattern, words in _IN_WORDS:
+        plain = re.sub(pattern, words, plain)
+    return plain.rstrip(".") + "." if plain else "The command line is wrong."
+
+
+def _wrong_choice(found: re.Match[str]) -> str:
+    value, option, choices = found.groups()
+    near = nearest(value.strip("'"), re.findall(r"'([^']*)'", choices))
+    hint = f"did you mean {near!r}? It" if near else "it"
+    return f"{option} is {value}; {hint} must be one of {choices}"
+
+
+# Python's words and tyro's, and ours.
+_IN_WORDS: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
+    (
+        r"^Error parsing (\S+): invalid literal .*?: (.*)",
+        r"\1 is \2; it must be a whole number",
+    ),
+    (r"^Error parsing (\S+): could not convert .*?: (.*)", r"\1 is \2; it must be a number"),
+    (
+        r"^Error parsing (\S+): Could not find valid parse for arguments: \[(.*)\]",
+        r"\1 is \2; write numbers with spaces between them, such as 64 64",
+    ),
+    (r"^invalid choice (.*) for argument '(\S+)'.*\((.*)\)", _wrong_choice),
+    (r"^Missing from .*?: [A-Z.,\[\]{} ]+?(?=[A-Z][a-z'])", "The command lacks: "),
+    (r" \(required\)", ""),
+    (r"^Error parsing \w+: ", ""),  # a rule of a dataclass, in its own words
+)
+
+
+def _option_names(kind: Any, default: Any, path: str = "--") -> list[str]:
+    """Returns the options of a dataclass, those of dataclasses in it among them."""
+    found = []
+    for field in dataclasses.fields(kind):
+        name, value = path + field.name.replace("_", "-"), getattr(default, field.name, None)
+        inner = dataclasses.is_dataclass(value) and not isinstance(value, type)
+        found += _option_names(value, value, f"{name}.") if inner else [name]
+    return found

@@ -1,0 +1,40 @@
+"""What an experiment is: builder functions, and the data that they are called with.
+
+Nothing heavy is imported here, so that a list of experiments or a help page comes at once.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import tyro
+
+from purerl.experiment.options import Engine
+from purerl.ppo.config import Config, Evaluation
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What is trained and how: builders (functions) and settings (frozen dataclasses).
+
+    `build_env(env, engine) -> Env` and `build_network(network, observation, action_size) ->
+    Network`, where `observation` is one environment's, zeros of the right shapes. Every setting can
+    be overridden on the command line: `--ppo.learning-rate 1e-3 --env.forward-weight 2`.
+    """
+
+    build_env: Callable[[Any, str], Any]
+    env: Any
+    build_network: Callable[[Any, Any, int], Any]
+    network: Any
+    ppo: Config
+    seed: Annotated[int, tyro.conf.arg(help="Seed of everything random in the run.")] = 1
+    engine: Annotated[
+        Engine,
+        tyro.conf.arg(
+            help="Physics engine; auto: c (MuJoCo's C code) where JAX is on a CPU, else jax (MJX)."
+        ),
+    ] = "auto"
+    evaluation: Evaluation = Evaluation()
+
+
+BUILDERS = ("build_env", "build_network")

@@ -1,0 +1,150 @@
+"""All checks of an experiment, one after another: its sizes, environment and network, its speed."""
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+
+from purerl.checks import examine_env, examine_network
+from purerl.checks.findings import Finding, error, ok, warning
+from purerl.checks.user_code import users_errors
+from purerl.core.env import State
+from purerl.core.errors import UserError
+from purerl.core.records import PyTree
+from purerl.devices import memory
+from purerl.devices.programs import abstract_state, compile_programs
+from purerl.devices.shards import Shards
+from purerl.experiment.definition import Experiment
+from purerl.experiment.objects import Setup, build, naming_broken_rules
+from purerl.ppo.config import Config, Evaluation
+from purerl.ppo.learner import is_recurrent
+
+FEW_SAMPLES = 32  # in a minibatch, whose gradient is then mostly noise
+FEW_UPDATES = 50  # of a run: a cart-pole had 335 of 1000 after 48, and 901 after 122
+OBSERVATIONS = 256  # that a network is tried on, at most
+SHARE = 0.5  # of the memory: what the estimate leaves out may be as much again
+
+
+def examine(chosen: Experiment, speed: bool) -> Iterator[Finding]:
+    """Yields what is found of an experiment.
+
+    Args:
+      chosen: the experiment, with its overrides.
+      speed: whether to measure it too.
+    """
+    try:
+        setup = build(chosen)
+    except UserError as broken:
+        yield error("build", str(broken))
+        return
+    with users_errors(""), naming_broken_rules(setup.env):
+        abstract = abstract_state(*setup[:3])
+    yield ok("build", f"{type(setup.env).__name__}, engine {setup.engine}")
+    found = [check_memory(setup, abstract), check_minibatch(setup, abstract)]
+    yield from [*found, *check_settings(setup.config)]
+    env_found = []
+    for finding in examine_env.examine(setup.env):
+        env_found.append(finding)
+        yield finding
+    if any(one.level == "error" for one in [*found, *env_found]):
+        return  # what follows would fail by the same, or fill the memory
+    with users_errors("The network: "):
+        few = _starts(setup, min(setup.config.num_envs, OBSERVATIONS))
+        yield from examine_network.examine(setup.network, few.observation)
+    if speed:
+        yield from _speeds(setup, _starts(setup, setup.config.num_envs))
+
+
+def check_memory(setup: Setup, abstract: PyTree) -> Finding:
+    """Compares what a run takes at least with the memory that there is."""
+    parts = memory.least(setup.config, abstract, setup.env.action_size)
+    has, total = memory.room(), sum(parts.values())
+    try:
+        memory.check_room(parts, has)
+    except ValueError as broken:
+        return error("memory", str(broken))
+    most = max(parts, key=lambda name: parts[name])
+    said = (
+        f"a run takes {total / 1e6:,.1f} MB at least, {parts['rollouts'] / 1e6:,.1f} of them for "
+        f"rollouts; there are {has / 1e6:,.0f} MB"
+    )
+    if total > SHARE * has:
+        return warning("memory", f"{said}: it may not do, so lower {memory.CURES[most]}.")
+    return ok("memory", said)
+
+
+def check_minibatch(setup: Setup, abstract: PyTree) -> Finding:
+    """Warns of minibatches so small that their gradients are noise."""
+    config, recurrent = setup.config, is_recurrent(abstract.carry)
+    samples = config.steps_per_update // config.num_minibatches
+    what = f"{config.num_minibatches} in an update, of {samples:,} steps each"
+    if samples < FEW_SAMPLES:
+        return warning("minibatches", f"{what}: lower ppo.num_minibatches.")
+    whole = f", {config.num_envs // config.num_minibatches} whole rollouts" if recurrent else ""
+    return ok("minibatches", what + whole)
+
+
+def check_settings(config: Config) -> Iterator[Finding]:
+    """Warns of a run that ends before it has learned, and of a setting that nothing reads."""
+    if config.num_updates < FEW_UPDATES:
+        what = f"{config.num_updates} in the whole run, of {config.steps_per_update:,} steps each"
+        yield warning("updates", f"{what}: lower ppo.rollout_length, or raise ppo.num_steps.")
+    fixed = config.schedule != "adaptive_kl"
+    if not fixed and config.num_epochs * config.num_minibatches == 1:
+        what = "an update has one minibatch, before which the policy has not moved, so its KL is 0"
+        yield warning("schedule", f"{what} and the rate only rises: raise ppo.num_epochs.")
+    if fixed and config.desired_kl != Config.desired_kl:
+        what = f"nothing reads {config.desired_kl} where ppo.schedule is {config.schedule!r}"
+        yield warning("desired_kl", f"{what}: choose 'adaptive_kl', or leave desired_kl out.")
+
+
+def _starts(setup: Setup, number: int) -> State:
+    """Returns fresh environments."""
+    keys = jax.random.split(jax.random.key(0), number)
+    return jax.jit(jax.vmap(setup.env.reset))(keys)
+
+
+def _speeds(setup: Setup, start: State) -> Iterator[Finding]:
+    """Measures the environment alone, and an update, of the run's sizes."""
+    config, env = setup.config, setup.env
+    shape = (config.num_envs, env.action_size)
+
+    @jax.jit
+    def steps(state: State, key: Any) -> State:
+        def one(state: State, key: Any) -> tuple[State, None]:
+            action = jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
+            return jax.vmap(env.step)(state, action), None
+
+        return jax.lax.scan(one, state, jax.random.split(key, config.rollout_length))[0]
+
+    alone = _seconds(lambda: steps(start, jax.random.key(0)))
+    number = config.steps_per_update
+    with naming_broken_rules(env):
+        programs = compile_programs(
+            *setup[:3], Evaluation(number=0), True, Shards(), calls_host=setup.engine == "c"
+        )
+    states = [programs.init(jax.random.key(0))]
+
+    def update() -> Any:
+        states[0], metrics = programs.update(states[0])
+        return metrics
+
+    whole = _seconds(update)
+    yield ok("speed", f"{number / alone:,.0f} steps/s of {config.num_envs} environments alone")
+    left = config.num_updates * whole
+    yield ok(
+        "speed",
+        f"{number / whole:,.0f} steps/s in an update of {whole:.2f} s: {config.num_updates:,} "
+        f"updates take {left / 60:,.1f} min, without evaluations",
+    )
+
+
+def _seconds(function: Callable[[], Any]) -> float:
+    """Returns the shorter time of two calls, after one that compiles and warms [s]."""
+    times = []
+    for _ in range(3):
+        begun = time.perf_counter()
+        jax.block_until_ready(function())
+        times.append(time.perf_counter() - begun)
+    return min(times[1:])

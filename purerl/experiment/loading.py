@@ -1,0 +1,179 @@
+"""Where experiments come from: a name, a path or a module, and the text that is executed."""
+
+import ast
+import contextlib
+import importlib.util
+import re
+import sys
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from purerl.core.errors import UserError, one_line, unknown_name
+from purerl.experiment.definition import Experiment
+from purerl.experiment.kinds import suggest_field, wrong_value
+from purerl.experiment.settings_json import has_settings, to_json
+from purerl.machine.files import read_bytes
+from purerl.ppo.config import Config, Evaluation
+
+# The library's own experiments: in a clone the folder beside `purerl/`, where a link leads.
+OURS = (Path(__file__).parents[1] / "experiments").resolve()
+
+
+class Source(NamedTuple):
+    """An experiment and where it came from."""
+
+    experiment: Experiment
+    name: str  # names the folder under runs/
+    path: Path
+    text: bytes = b""  # of the file, as it was executed
+
+
+def _folders() -> list[Path]:
+    """Returns where named experiments are looked for: here, then the library's own."""
+    places = dict.fromkeys([(Path.cwd() / "experiments").resolve(), OURS])
+    return [place for place in places if place.is_dir()]
+
+
+def available() -> dict[str, Path]:
+    """Returns the named experiments, name -> file; of two of one name the first folder's.
+
+    They come in the order in which the folder's `__init__.py` mentions them, the others after.
+    """
+    found: dict[str, Path] = {}
+    for folder in _folders():
+        about = folder / "__init__.py"
+        order = re.findall(r"\w+", about.read_text()) if about.exists() else []
+        files = [file for file in sorted(folder.glob("[!.]*.py")) if _has_experiment(file)]
+        files.sort(key=lambda file: order.index(file.stem) if file.stem in order else len(order))
+        found = found | {file.stem: file for file in files if file.stem not in found}
+    return found
+
+
+def _has_experiment(path: Path) -> bool:
+    """Tells whether a file defines an experiment, as other scripts, or an editor's link, do not."""
+    text = b""
+    with contextlib.suppress(OSError):
+        text = path.read_bytes()
+    return re.search(rb"^experiment(: *Experiment)? = ", text, re.MULTILINE) is not None
+
+
+def summary(path: Path) -> str:
+    """Returns the first line of a file's docstring, without running the file."""
+    try:
+        text = ast.get_docstring(ast.parse(path.read_bytes()))
+    except (OSError, SyntaxError, ValueError):
+        text = None
+    return text.splitlines()[0] if text else ""
+
+
+def find(name: str) -> Experiment:
+    """Returns an experiment by name in experiments/, path of a Python file, or dotted module.
+
+    >>> find("cartpole_swingup").ppo.num_envs
+    64
+    """
+    return find_source(name).experiment
+
+
+def find_source(name: str) -> Source:
+    """Loads an experiment by name, path or module; see `find`."""
+    named = available()
+    if name.endswith(".py") or "/" in name:
+        if not Path(name).is_file():
+            raise UserError(f"There is no experiment file {name}.")
+        return load(Path(name))
+    if name in named:
+        return load(named[name])
+    spec = None
+    with contextlib.suppress(ImportError, ValueError):
+        spec = importlib.util.find_spec(name) if "." in name else None
+    if spec is not None and str(spec.origin).endswith(".py"):
+        return load(Path(str(spec.origin)))
+    if Path(name).exists() or Path(f"{name}.py").is_file():
+        raise UserError(f"{name} is no Python file; an experiment is one, as {Path(name).stem}.py.")
+    places = f" in {' or '.join(map(str, _folders()))}"
+    raise UserError(unknown_name("experiment", name, named, places))
+
+
+def load(
+    path: Path, name: str = "", text: bytes | None = None, origin: Path | None = None
+) -> Source:
+    """Loads the experiment that a Python file defines as `experiment = Experiment(...)`.
+
+    What is executed is the file's text and nothing else: Python's own loader would rather take
+    compiled code that it finds in `__pycache__`.
+
+    Args:
+      path: the file.
+      name: the experiment's, if that is not the file's.
+      text: what the file holds, where it has been read.
+      origin: the file that it is a copy of. That is its `__file__`: what the experiment reads
+        stands beside it.
+    """
+    text = read_bytes(path) if text is None else text
+    path = path.resolve()
+    place = origin or path
+    module_name = _module_name(path)
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    module = importlib.util.module_from_spec(spec)  # type: ignore[arg-type]  # it is a .py file
+    sys.modules[module_name] = module  # dataclasses and help texts look their module up
+    module.__file__ = str(place)
+    with _mistakes(str(path), place):
+        nodes = list(ast.walk(ast.parse(text, str(path))))
+    if any(isinstance(node, ast.ImportFrom) and node.level for node in nodes):
+        raise UserError(
+            f"{path} imports relatively (from . import ...), and a run keeps a copy of the file "
+            "that has to work alone: import by the full name."
+        )
+    with _mistakes(str(path), place):
+        exec(compile(text, str(path), "exec", dont_inherit=True), module.__dict__)
+    if not isinstance(found := getattr(module, "experiment", None), Experiment):
+        raise UserError(f"{path} defines no `experiment = Experiment(...)` (it is {found!r}).")
+    for field in ("env", "network", "ppo", "evaluation"):
+        if not has_settings(value := getattr(found, field)):
+            raise UserError(f"{path}: {field} is {value!r}; it must be a frozen dataclass's value.")
+        to_json(value, field)  # here, or the command line would meet what it cannot hold
+    if wrong := wrong_value(found):
+        raise UserError(f"{path}: {wrong}")
+    return Source(found, name or path.stem, path, text)
+
+
+def _module_name(path: Path) -> str:
+    """Returns a file's name as a module: in a package its own, so that its source counts there."""
+    if OURS in path.parents:
+        return ".".join(("purerl.experiments", *path.with_suffix("").relative_to(OURS).parts))
+    root = path.parent
+    while (root / "__init__.py").exists():
+        root = root.parent
+    # "" stands for the folder that Python was started in.
+    if root != path.parent and root in {Path(place).absolute() for place in sys.path}:
+        return ".".join(path.with_suffix("").relative_to(root).parts)
+    return f"purerl_experiment_{path.stem}"
+
+
+@contextlib.contextmanager
+def _mistakes(file: str, place: Path) -> Iterator[None]:
+    """Turns an error in a person's own file into one line with the line that they need to see.
+
+    `place` is where the file's modules stand: a run has a copy of it alone.
+    """
+    try:
+        yield
+    except SyntaxError as error:
+        raise UserError(f"{error.filename}, line {error.lineno}: {error.msg}.") from error
+    except Exception as error:
+        lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == file]
+        where = f", line {lines[-1]}" if lines else ""
+        missing = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
+        beside, hint = place.parent / missing.partition(".")[0], ""
+        if missing == "purerl":
+            of_run = (Path(file).parent / "config.json").exists()
+            hint = " The run was made by an older purerl: train it anew." if of_run else ""
+        elif missing and (beside.is_dir() or beside.with_suffix(".py").exists()):
+            hint = f"; it stands beside the file: set PYTHONPATH={place.parent}"
+        elif missing:
+            hint = "; install it, or correct its name"
+        hint = hint or suggest_field(str(error), Config, Evaluation, Experiment)
+        raise UserError(f"{file}{where}: {one_line(error)}{hint}") from error

@@ -1,0 +1,189 @@
+"""An experiment's objects, built from its settings; what breaks a rule of theirs, in one line."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from purerl.checks.check_env import check_fields, check_members, check_shapes, shapes_of_reset
+from purerl.checks.user_code import check_takes, users_errors
+from purerl.core.env import Env, EnvError
+from purerl.core.errors import RunError, UserError, one_line
+from purerl.core.records import Network, PolicyOutput, PyTree
+from purerl.devices import memory, threads
+from purerl.devices.check_sizes import check_minibatches
+from purerl.devices.programs import abstract_state
+from purerl.experiment.definition import Experiment
+from purerl.experiment.kinds import wrong_value
+from purerl.ppo.config import Config
+from purerl.ppo.learner import is_recurrent
+
+
+class Setup(NamedTuple):
+    """An experiment's objects, built."""
+
+    config: Config
+    env: Env
+    network: Network
+    engine: str  # resolved: never "auto"
+
+
+def build(chosen: Experiment) -> Setup:
+    """Calls the builders; what breaks a rule, of the settings or the protocols, is a UserError."""
+    # Imported here, as below: `compare` reads runs, and needs no MuJoCo.
+    from purerl.physics.interface import choose_engine
+
+    _check_precision()
+    if wrong := wrong_value(chosen):
+        raise UserError(f"The experiment's {wrong}")
+    check_takes("build_env", chosen.build_env, "options", "engine")
+    check_takes("build_network", chosen.build_network, "options", "observation", "action_size")
+    threads.leave_one(chosen.engine)
+    with users_errors(""):
+        engine = choose_engine(chosen.engine)
+    with users_errors("build_env: "):
+        env = chosen.build_env(chosen.env, engine)
+    if env is None:
+        raise UserError("build_env returned None: its last line must return the environment.")
+    about = f"The environment {type(env).__name__}: "
+    with users_errors(""):
+        check_members(env)
+    with users_errors(about):
+        state = shapes_of_reset(env)
+        check_fields(state)
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state.observation)
+    with users_errors("build_network: "):
+        network = chosen.build_network(chosen.network, zeros, env.action_size)
+    setup = Setup(chosen.ppo, env, network, engine)
+    with users_errors(""):
+        _check_network(network, zeros, env.action_size)
+    with users_errors(""), naming_broken_rules(env):
+        # Sizes that do not fit together show here, in a second.
+        abstract = abstract_state(*setup[:3])
+        check_minibatches(setup.config, is_recurrent(abstract.carry), setup.config.num_envs)
+    return setup
+
+
+def check_memory(setup: Setup, abstract: PyTree, seeds: int, devices: int) -> None:
+    """Raises UserError, with the size to lower, if a run cannot fit into a device's memory.
+
+    Args:
+      setup: the experiment's objects.
+      abstract: shapes of one seed's state.
+      seeds: how many share the program.
+      devices: how many share the environments.
+    """
+    parts = memory.least(setup.config, abstract, setup.env.action_size)
+    with users_errors(""):
+        memory.check_room({k: x * seeds // devices for k, x in parts.items()}, memory.room())
+
+
+def _check_precision() -> None:
+    if jax.config.read("jax_enable_x64"):
+        raise UserError(
+            "JAX_ENABLE_X64 is on, which makes numbers float64; a run computes in float32: unset "
+            'it, or call jax.config.update("jax_enable_x64", False).'
+        )
+
+
+def _check_network(network: Network, observation: PyTree, action_size: int) -> None:
+    """Raises ValueError unless a network's answers have the shapes that the trainer reads."""
+    if not isinstance(network, Network):
+        raise ValueError(
+            f"build_network returned a {type(network).__name__}; it must return a "
+            "purerl.Network(init, apply). Of a Flax module, networks.from_linen makes one."
+        )
+    check_takes("network.init", network.init, "key")
+    check_takes("network.apply", network.apply, "params", "observation", "memory")
+    params, carry = _pair("init(key)", "parameters", network.init, jax.random.key(0))
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            raise ValueError(
+                f"The network's parameter {jax.tree_util.keystr(path)} is {leaf.dtype}: parameters "
+                "are trained, so they are floating-point numbers. Keep constants in the closure of "
+                "`apply`."
+            )
+    _check_memory_starts_at_zero(network, carry)
+    batch = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((2, *x.shape), x.dtype), (observation, carry)
+    )
+    said = "apply(params, observation, memory)"
+    output, following = _pair(said, "a purerl.PolicyOutput", network.apply, params, *batch)
+    if not isinstance(output, PolicyOutput):
+        raise ValueError(
+            f"The network's `apply` returned a {type(output).__name__} and a memory; it must be "
+            "a purerl.PolicyOutput and the memory."
+        )
+    scalar, action = (2,), (2, action_size)
+    normal = output.distribution
+    answers = [("loc", normal.loc, action), ("scale", normal.scale, action)]
+    for name, answer, shape in [*answers, ("value", output.value, scalar)]:
+        if answer.shape != shape:
+            raise ValueError(
+                f"The network's {name} is {list(answer.shape)} for 2 observations and "
+                f"{action_size} actions; it must be {list(shape)}."
+            )
+    kinds = [jax.tree.map(lambda x: (x.shape, x.dtype), tree) for tree in (batch[1], following)]
+    if kinds[0] != kinds[1]:
+        raise ValueError(
+            f"The network's memory goes in as {kinds[0]} and comes back as {kinds[1]}, for 2 "
+            "environments; `apply` must return it as it was given, and `init` one environment's."
+        )
+
+
+def _check_memory_starts_at_zero(network: Network, carry: PyTree) -> None:
+    """Raises ValueError unless `init` gives a memory of zeros, with which every episode starts."""
+    if jax.tree.leaves(carry):
+        memory = jax.jit(lambda key: network.init(key)[1])(jax.random.key(0))
+        if any(np.asarray(x).any() for x in jax.tree.leaves(memory)):
+            raise ValueError(
+                "The network's memory starts as other numbers than 0, and every episode starts "
+                "with zeros: return zeros from `init`, and add the rest in `apply`."
+            )
+
+
+def _pair(call: str, first: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Returns the shapes of what a network's function returns: two things, the second a memory."""
+    with users_errors(f"The network's {call}: "):
+        found = jax.eval_shape(function, *arguments)
+    if type(found) is not tuple or len(found) != 2:
+        raise ValueError(
+            f"The network's {call} returned a {type(found).__name__}; it must return {first} and "
+            "the memory, which is () of a network without one."
+        )
+    return found
+
+
+@contextlib.contextmanager
+def naming_broken_rules(env: Env) -> Iterator[None]:
+    """Makes one line of programs that cannot be traced because the environment breaks a rule.
+
+    The rules are looked at only then: to trace a step of the environment may take seconds.
+    """
+    try:
+        yield
+    except (UserError, RunError):
+        raise
+    except Exception as error:
+        try:
+            check_shapes(env)
+        except EnvError as broken:
+            what = one_line(broken)
+            raise UserError(f"The environment {type(env).__name__}: {what}") from error
+        except Exception:
+            pass  # no rule, but an error in its code, of which the first one tells more
+        with users_errors(""):
+            raise
+
+
+def physics_hash(env: Env) -> str | None:
+    """Returns a sha256 of the model that an environment simulates; None if it has no `physics`."""
+    model = getattr(getattr(env, "physics", None), "model", None)
+    if model is None:
+        return None
+    from purerl.physics.lookup import hash_model
+
+    return hash_model(model)

@@ -1,0 +1,101 @@
+"""Options of commands: how a run is made, kept and shown, and how its policy is played."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from purerl.core.errors import UserError
+
+Engine = Literal["auto", "c", "jax", "warp"]
+
+
+def check_seed(seed: int) -> None:
+    """Raises UserError for a seed that JAX would take for another one: it keeps 32 bits."""
+    if not 0 <= seed < 2**32:
+        raise UserError(f"seed is {seed}; it must be at least 0 and below 2**32.")
+
+
+@dataclass(frozen=True)
+class PlayOptions:
+    """Which run's policy is played, from which checkpoint, and where."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """The run's folder, such as runs/ant_run/seed1."""
+    checkpoint: str = "latest"
+    """latest, best (highest evaluation return), or an update's number."""
+    seed: int = 0
+    """Seed of the episodes; never meets a seed of training."""
+    engine: Literal["", Engine] = ""
+    """Physics engine, where it should not be the run's own."""
+    trust: bool = False
+    """Execute the run's experiment.py though this machine does not know it: read it first."""
+
+    def __post_init__(self) -> None:
+        """Checks the rules."""
+        check_seed(self.seed)
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a run is made, kept and shown; only vmapped seeds and num_shards change its bits."""
+
+    name: str | None = None
+    """Name of the run, the folder under runs/<experiment>/ (default: seed<seed>)."""
+    num_seeds: int = 1
+    """Train this many seeds, from --seed upwards, each in a run's folder of its own."""
+    seeds_by: Literal["vmap", "map"] = "vmap"
+    """vmap: all in one program, with the statistics of single runs but other bits; map: one after
+    another, with the bits of single runs."""
+    num_shards: int = 0
+    """Cut the environments into this many parts, a multiple of the devices that share them: on any
+    number of devices the bits are the same. 0: a part for each device; 1: use one device."""
+    distributed: str = ""
+    """One of several processes that train together: auto (SLURM, Open MPI, ...), or
+    HOST:PORT,NUM_PROCESSES,PROCESS_ID, HOST being that of process 0, which alone writes the run."""
+    portable: bool = False
+    """On a CPU: the same bits on every x86-64 processor with AVX2, at some cost in speed."""
+    resume: bool = False
+    """Go on from the last whole checkpoint of the run."""
+    allow_changes: bool = False
+    """Resume although settings, versions or device differ; written down in manifest.json."""
+    runs: Path = Path("runs")
+    """Folder of all runs."""
+    log_every: int = 0
+    """Updates between two lines of metrics.jsonl; 0: chosen for about 500 lines."""
+    checkpoints: int = 10
+    """Checkpoints over the run, evenly spaced, the last one at the end."""
+    keep: int = 3
+    """Newest checkpoints to keep, besides the best one by evaluation."""
+    tensorboard: bool = False
+    """Write TensorBoard files too (needs purerl[tensorboard])."""
+    wandb: Literal["off", "online", "offline"] = "off"
+    """Send metrics to Weights & Biases too (needs purerl[wandb])."""
+    wandb_project: str = "purerl"
+    """The W&B project."""
+    video: bool = False
+    """When training has ended, make a video of the policy, as `python -m purerl.render` does."""
+    cache: bool = True
+    """Compiled programs are kept in JAX_COMPILATION_CACHE_DIR, else in purerl/jax in XDG_CACHE_HOME
+    or ~/.cache; with --no-cache they are not."""
+
+    def __post_init__(self) -> None:
+        """Checks the rules."""
+        lowest = {"num_seeds": 1, "num_shards": 0, "log_every": 0, "checkpoints": 0, "keep": 1}
+        for name, least in lowest.items():
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}.")
+
+    @property
+    def vmapped_seeds(self) -> int:
+        """How many seeds share one program; 1 if each is trained by itself."""
+        return self.num_seeds if self.seeds_by == "vmap" else 1
+
+    def check_vmapped(self, number: int) -> None:
+        """Raises UserError where vmapped seeds would have that many shards."""
+        if self.vmapped_seeds > 1 and number > 1:
+            raise UserError(
+                f"num_shards is {number}, and {self.num_seeds} vmapped seeds share one program "
+                "on one device; use --seeds-by map, or leave out --num-shards."
+            )

@@ -1,0 +1,39 @@
+"""SIGTERM and SIGINT as a question that a loop asks: was it told to stop?"""
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from purerl.machine import output
+
+
+@contextmanager
+def stop_signals(
+    end: Callable[[int], Any], then: str = "finishing this chunk, then saving"
+) -> Iterator[Callable[[], bool]]:
+    """Yields a question: did SIGTERM or SIGINT ask to stop? A second signal calls `end(exit code)`.
+
+    `then` is what is told at the first.
+
+    Only the main thread receives signals: in another one the answer is always no.
+    """
+    received: list[int] = []
+
+    def handle(number: int, frame: Any) -> None:
+        if received:
+            end(128 + number)
+            return
+        received.append(number)
+        name = signal.Signals(number).name
+        output.warn(f"\n{name}: {then}. Once more to stop at once.")
+
+    old = {}
+    if threading.current_thread() is threading.main_thread():
+        old = {number: signal.signal(number, handle) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield lambda: bool(received)
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)

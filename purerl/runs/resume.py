@@ -1,0 +1,217 @@
+"""May this process begin a run in a folder, or go on with the one that is there?
+
+Pure functions of what the folder held (`folder.Folder`) and of what would be written now.
+"""
+
+import uuid
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from purerl.core.errors import UserError
+from purerl.experiment import settings_json
+from purerl.experiment.definition import Experiment
+from purerl.experiment.loading import Source
+from purerl.experiment.source_hashes import hash_code
+from purerl.machine.files import draft_of
+from purerl.ppo.config import Config
+from purerl.runs import manifest
+from purerl.runs.folder import CODE, CONFIG, OURS, Folder, check_manifest
+from purerl.runs.identity import fingerprint
+
+EDITED = "fingerprint: config.json, manifest.json or experiment.py is not what the run wrote"
+MANY = 9  # edited files, which a refusal to resume then counts and does not list
+
+
+class Description(NamedTuple):
+    """The files that describe a run, as a process would write them now."""
+
+    config: dict[str, Any]
+    manifest: dict[str, Any]
+    source: Source
+
+
+def check_new_or_resume(
+    folders: Sequence[Folder], experiments: Sequence[Experiment], resume: bool
+) -> None:
+    """Raises UserError if a new run would overwrite something, or there is nothing to resume.
+
+    Args:
+      folders: of each seed. Seeds that were killed while starting may have only some of them.
+      experiments: of each seed.
+      resume: whether the runs are to go on.
+    """
+    if resume and not any(folder.exists for folder in folders):
+        where = folders[0].path
+        raise UserError(f"There is no run {where} to resume; leave out --resume to start it.")
+    for folder, chosen in zip(folders, experiments, strict=True):
+        _check_usable(folder, chosen, resume)
+
+
+def _check_usable(folder: Folder, chosen: Experiment, resume: bool) -> None:
+    """Raises UserError if one folder may not be written."""
+    for name in sorted(folder.links):
+        what = f"{folder.path / name} is no file of the run, but a link or worse"
+        raise UserError(f"{what}: remove it.")
+    if folder.is_begun and not resume:
+        raise UserError(f"The run {folder.path} exists{_how_to_begin(folder, chosen)}")
+    # Drafts are of a run that was killed while it started.
+    strange = folder.names - OURS - {draft_of(Path(name)).name for name in OURS}
+    if strange and not folder.is_run:
+        what = f"{folder.path} is no run (it holds {min(strange)})"
+        raise UserError(f"{what}; use another --name.")
+    # config.json is written before all that a run learns.
+    if not folder.is_run and (folder.updates or folder.damaged):
+        raise UserError(
+            f"{folder.path} holds checkpoints, but its {CONFIG} is gone, which says what they "
+            "are of. Bring it back from a copy, or use another --name."
+        )
+
+
+def _how_to_begin(folder: Folder, chosen: Experiment) -> str:
+    """Returns what to do where a run has the folder already; one of other settings cannot go on."""
+    there = folder.config.get("settings", {})
+    unlike = manifest.differences(there, settings_json.to_json(chosen))
+    if not unlike:
+        return "; use --resume to go on, or another --name."
+    if len(unlike) == 1 and unlike[0].startswith("ppo.num_steps"):
+        return f" ({unlike[0]}); to train longer, copy it first (docs/howto/go_on.md)."
+    more = f", and {len(unlike) - 1} more" if len(unlike) > 1 else ""
+    return f", with other settings ({unlike[0]}{more}); use another --name."
+
+
+def describe_config(source: Source, chosen: Experiment, schedule: dict[str, Any]) -> dict[str, Any]:
+    """Returns config.json: every setting of the run; UserError if one cannot be read back."""
+    values = settings_json.to_json(chosen)
+    rebuilt = settings_json.from_json(source.experiment, values)
+    for name, value in settings_json.settings_of(chosen).items():
+        if (read := getattr(rebuilt, name)) != value:
+            raise UserError(
+                f"{CONFIG} cannot hold {name}: {value} would be read back as {read}. Give what "
+                "the experiment's file may leave empty (None, or ()) a value of its own kind there."
+            )
+    return {"experiment": source.name, "settings": values, "schedule": schedule}
+
+
+def what_to_write(
+    folder: Folder, now: Description, allow_changes: bool, begun: bool
+) -> dict[str, Any] | None:
+    """Returns the manifest.json to write before training; None: the run goes on as it is.
+
+    Args:
+      folder: the run, or where it will be.
+      now: what this process would write of a new run.
+      allow_changes: whether to go on, and note it, where the old run would not go on exactly.
+      begun: whether it, or a seed that trains together with it, has a checkpoint. What has none is
+        written anew, since a mistake in the command may have ended it.
+
+    Raises:
+      UserError: this process would not continue the run exactly; or it has nothing to train.
+    """
+    if not folder.is_run:
+        return _identity(folder) | now.manifest
+    found = changes(folder, now)
+    if not found:
+        return None
+    if not begun:
+        return _identity(folder) | now.manifest
+    if not allow_changes:
+        raise UserError(
+            f"The run {folder.path} was begun under other conditions, so it would not go on "
+            "exactly:\n  " + "\n  ".join(_shortened(found)) + f"\n{cure(found)}, train anew under "
+            "another --name, or go on all the same with --allow-changes."
+        )
+    _check_trains_what_is_new(folder, now.config, found)
+    return now.manifest | _noted(folder, found)
+
+
+def changes(folder: Folder, now: Description) -> list[str]:
+    """Returns in what this process would not continue the run exactly, a line each."""
+    found = manifest.differences(folder.config, now.config)
+    found += manifest.differences(check_manifest(folder), now.manifest)
+    if hash_code(folder.code) != hash_code(now.source.text):
+        found.append(f"{CODE}: {now.source.path} has been edited")
+    return found + edited(folder)
+
+
+def edited(folder: Folder) -> list[str]:
+    """Returns a line if the three files that describe a run are not what it wrote."""
+    written = fingerprint(folder.config, folder.manifest, folder.code)
+    return [] if folder.manifest.get("fingerprint") == written else [EDITED]
+
+
+def _check_trains_what_is_new(folder: Folder, config: dict[str, Any], found: list[str]) -> None:
+    """Raises UserError where a run that is done would be given settings that it never had."""
+    changed = [line for line in found if line.startswith("settings.")]
+    planned = Config(**config["settings"]["ppo"]).num_updates
+    if changed and max(folder.updates, default=0) >= planned:
+        raise UserError(
+            f"The run {folder.path} has all of its updates, so none would be trained with what is "
+            "new:\n  " + "\n  ".join(changed) + "\nRaise --ppo.num-steps, or use another --name."
+        )
+
+
+def cure(found: list[str]) -> str:
+    """Returns what takes a run back to what it was, by what was found."""
+    if EDITED in found:
+        return "Put the file back that was edited"
+    if any(line.startswith("vmapped_seeds") for line in found):
+        return "Give the --num-seeds and --seed it was begun with"
+    if any("purerl_experiment_" in line and "(absent)" in line for line in found):
+        return "Give the command in the folder it was begun in"
+    if all(line.startswith(("source.", f"{CODE}: ")) for line in found):
+        return "Put back what was edited"
+    if all(line.startswith("model: ") for line in found):  # no setting and no code has made it so
+        return "Put back what was edited of the MuJoCo model, the MJCF or a file that it reads"
+    given = "Give the command it was begun with" + _options(found)
+    if any(line.startswith("settings.ppo.num_steps") for line in found):
+        return f"{given}; to train longer, copy the run first (docs/howto/go_on.md)"
+    return given
+
+
+def _options(found: list[str]) -> str:
+    """Returns the options that bring settings back that differ, as a clause; "" if there is none.
+
+    >>> _options(["settings.ppo.num_steps: 300000 -> 500000", "versions.jax: 1 -> 2"])
+    ', which has --ppo.num-steps 300000'
+    """
+    lines = [line.removeprefix("settings.") for line in found if line.startswith("settings.")]
+    parts = [line.partition(" -> ")[0].split(": ", 1) for line in lines]
+    words = [
+        f"--{name.replace('_', '-')} {value.strip('[]').replace(',', '')}" for name, value in parts
+    ]
+    return f", which has {' '.join(words)}" if words else ""
+
+
+def _shortened(found: list[str]) -> list[str]:
+    """Returns differences for a person: many edited files as a number, and what to do for NPROC."""
+    pin = "device.threads"  # a CPU's bits depend on the size of XLA's thread pool
+    threads = [line.split()[1] for line in found if line.startswith(pin)]
+    found = manifest.count_files(found, MANY, ", as of another version of purerl")
+    return found + [f"(NPROC={number} brings {pin} back)" for number in threads]
+
+
+def _identity(folder: Folder) -> dict[str, str]:
+    """Returns what tells a new run from all others: a random id, and the folder's name."""
+    return {"run_id": uuid.uuid4().hex[:12], "name": folder.path.name}
+
+
+def _noted(folder: Folder, found: list[str]) -> dict[str, Any]:
+    """Returns what manifest.json says of a run that goes on under other conditions.
+
+    A copy under another name gets a run_id of its own: loggers must not take it for the first run.
+    """
+    old = folder.manifest
+    known = {name: old[name] for name in ("run_id", "name")}
+    after = max(folder.updates, default=0)
+    entry: dict[str, Any] = {"after_update": after, "changes": found}
+    entry["fingerprint"] = old["fingerprint"]
+    if known["name"] != folder.path.name:
+        entry, known = {"of": known} | entry, _identity(folder)
+    had = {name: old[name] for name in ("had_checkpoint",) if name in old}
+    return known | had | with_change(old, entry)
+
+
+def with_change(facts: dict[str, Any], entry: dict[str, Any]) -> dict[str, Any]:
+    """Returns the list of what --allow-changes let pass, as manifest.json has it, with one more."""
+    return {"allowed_changes": [*facts.get("allowed_changes", []), entry]}

@@ -1,0 +1,135 @@
+"""Loggers, which are no part of a run: what they miss changes nothing.
+
+TensorBoard and W&B have threads of their own, for which training never waits.
+"""
+
+import importlib.util
+import math
+import queue
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from purerl.core.errors import UserError, one_line
+from purerl.experiment.options import RunOptions
+from purerl.machine.output import Say
+from purerl.runs.folder import Folder
+from purerl.runs.metrics_file import Record
+
+
+class BackgroundLogger:
+    """A sink (`log(record)`, `close()`) in a thread of its own.
+
+    It is dropped, with one message, when it raises or lags.
+    """
+
+    def __init__(self, name: str, open_sink: Callable[[], Any], say: Say, size: int = 256) -> None:
+        """Opens the sink in the thread; `size` records may wait before it counts as too slow."""
+        self.name, self.say = name, say
+        self.queue: queue.Queue[Record | None] = queue.Queue(size)
+        self.dropped = threading.Event()
+        self.thread = threading.Thread(target=self._work, args=(open_sink,), daemon=True)
+        self.thread.start()
+
+    def log(self, record: Record) -> None:
+        """Hands a record over; never waits."""
+        if self.dropped.is_set():
+            return
+        try:
+            self.queue.put_nowait(record)
+        except queue.Full:
+            self._drop(f"it is too slow ({self.queue.maxsize} records wait)")
+
+    def close(self, timeout: float = 20.0) -> None:
+        """Lets what waits be written, for at most `timeout` [s]."""
+        if self.dropped.is_set():
+            return
+        try:
+            self.queue.put(None, timeout=timeout)
+        except queue.Full:
+            self._drop("it is too slow to finish")
+            return
+        self.thread.join(timeout)
+        if self.thread.is_alive():
+            self._drop(f"it did not finish within {timeout:g} s")
+
+    def _work(self, open_sink: Callable[[], Any]) -> None:
+        try:
+            sink = open_sink()
+            while (record := self.queue.get()) is not None and not self.dropped.is_set():
+                sink.log(record)
+            sink.close()
+        except BaseException as error:  # whatever a logger does, training goes on
+            self._drop(one_line(error))
+
+    def _drop(self, reason: str) -> None:
+        if not self.dropped.is_set():
+            self.dropped.set()
+            self.say(f"The {self.name} logger is dropped: {reason}. Training goes on.")
+
+
+class _TensorBoardSink:
+    """Writes scalars for TensorBoard; what an earlier life wrote after `update` is hidden."""
+
+    def __init__(self, folder: Path, update: int) -> None:
+        from tensorboardX import SummaryWriter
+
+        self.writer = SummaryWriter(str(folder / "tensorboard"), purge_step=update + 1)
+        self.close = self.writer.close
+
+    def log(self, record: Record) -> None:
+        for name, value in record.items():
+            if isinstance(value, float) and math.isfinite(value):
+                self.writer.add_scalar(name, value, record["update"])
+
+
+class WandbSink:
+    """Sends records to Weights & Biases; a resumed run goes on under the same id."""
+
+    def __init__(self, folder: Folder, mode: Any, project: str) -> None:
+        """Begins a W&B run, or goes on with it: `mode` is online or offline."""
+        import wandb
+
+        self.run = wandb.init(
+            project=project, id=folder.manifest["run_id"], resume="allow", mode=mode,
+            dir=str(folder.path), name="/".join(folder.path.absolute().parts[-2:]),
+            config=folder.config, settings=wandb.Settings(console="off"),
+            reinit="create_new",  # several seeds in one process are several W&B runs
+        )  # fmt: skip
+        self.run.define_metric("update")
+        self.run.define_metric("*", step_metric="update")
+        self.log, self.close = self.run.log, self.run.finish
+
+
+def check_loggers(options: RunOptions) -> None:
+    """Raises UserError, with the line to paste, unless the packages of loggers are there."""
+    asked = {"tensorboardX": options.tensorboard, "wandb": options.wandb != "off"}
+    for package, wanted in asked.items():
+        if wanted and importlib.util.find_spec(package) is None:
+            raise UserError(
+                f"The package {package} is not installed; "
+                f"run: pip install 'purerl[{package.removesuffix('X')}]'"
+            )
+
+
+def open_loggers(
+    options: RunOptions, folder: Folder, update: int, say: Say
+) -> list[BackgroundLogger]:
+    """Starts the loggers asked for.
+
+    Args:
+      options: the run's options.
+      folder: the run.
+      update: where it goes on; what TensorBoard has after it is hidden.
+      say: told of a logger that is dropped.
+    """
+    found = []
+    if options.tensorboard:
+        found.append(
+            BackgroundLogger("TensorBoard", lambda: _TensorBoardSink(folder.path, update), say)
+        )
+    if options.wandb != "off":
+        mode, project = options.wandb, options.wandb_project
+        found.append(BackgroundLogger("W&B", lambda: WandbSink(folder, mode, project), say))
+    return found

@@ -1,0 +1,228 @@
+"""Trains the seeds of a command: vmapped ones together, others one after another.
+
+Seeds mapped one after another are runs one after another, with the same compiled programs: their
+bits are those of single runs by construction. Vmapped seeds share one program, whose bits depend on
+their number. They are saved and resumed together, always at an update that all of them have on the
+disk.
+"""
+
+import functools
+import hashlib
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from purerl.checks.examine_env import tell_first
+from purerl.checks.user_code import program_errors
+from purerl.core.errors import RunError, UserError
+from purerl.core.records import PyTree, TrainState
+from purerl.devices import processes
+from purerl.devices.processes import in_first_process, kept_by_first
+from purerl.devices.programs import Programs, compile_programs
+from purerl.devices.shards import Shards
+from purerl.experiment import objects
+from purerl.experiment.definition import Experiment
+from purerl.experiment.objects import Setup
+from purerl.experiment.options import RunOptions
+from purerl.machine import output
+from purerl.machine.command_errors import tell
+from purerl.machine.files import disk_errors
+from purerl.machine.lock import FolderLock
+from purerl.machine.output import Say
+from purerl.runs import checkpoint, checkpoint_folder, folder as run_folder, identity, manifest
+from purerl.runs.folder import Folder, check_manifest
+from purerl.runs.metrics_file import MetricsFile, Record, keep_whole_lines
+from purerl.runs.resume import (
+    with_change,
+)
+from purerl.training import console, loop
+from purerl.training.loggers import open_loggers
+from purerl.training.plan import Plan
+from purerl.training.writer import RunWriter
+
+NO_CHECKPOINT = {"update": 0, "metrics_bytes": 0, "metrics_sha256": hashlib.sha256().hexdigest()}
+
+
+class Job(NamedTuple):
+    """What the seeds of one command have in common; no disk is read for it."""
+
+    options: RunOptions
+    chosen: Experiment  # of the first seed
+    setup: Setup
+    abstract: PyTree  # shapes of one seed's state
+    shards: Shards
+    plan: Plan
+    facts: dict[str, Any]  # what manifest.json says of a run that begins now
+    stop: Callable[[], bool]  # tells whether a signal asked to stop
+
+
+class Seed(NamedTuple):
+    """One run of the command. Only the first process knows what its folder holds."""
+
+    path: Path
+    number: int
+    folder: Folder | None = None
+    lock: FolderLock | None = None
+
+    @property
+    def checkpoints(self) -> Path:
+        """The folder of its checkpoints."""
+        return self.path / run_folder.CHECKPOINTS
+
+
+def train_all(job: Job, seeds: list[Seed]) -> None:
+    """Trains vmapped seeds together, and others one after another; RunError if one failed."""
+    fresh = in_first_process(lambda: not all(s.folder and s.folder.updates for s in seeds))
+    programs = functools.cache(lambda: _compile(job, fresh))
+    groups = [[seed] for seed in seeds] if job.options.vmapped_seeds == 1 else [seeds]
+    failed = []
+    for group in groups:
+        try:
+            _train_together(job, group, programs)
+        except RunError as error:  # the seeds after it can still be trained
+            failed.append(str(error))
+            if len(groups) > 1:  # they may take long, or be stopped
+                tell(error)
+    if failed:
+        raise RunError(" ".join(failed))
+
+
+def _compile(job: Job, fresh: bool) -> Programs:
+    """Compiles the programs, `init` among them for a fresh run; prints what is not exact."""
+    setup = job.setup
+    with objects.naming_broken_rules(setup.env):
+        programs = compile_programs(
+            *setup[:3], job.chosen.evaluation, fresh, job.shards, job.options.vmapped_seeds,
+            calls_host=setup.engine == "c",
+        )  # fmt: skip
+    if processes.is_first():
+        for place in _unordered(programs):
+            output.say(f"Not bit-exact: nothing fixes the order of the sum {place}")
+    return programs
+
+
+def _unordered(programs: Programs) -> list[str]:
+    """Returns the sums whose order nothing fixes: on a CPU it is fixed."""
+    return programs.unordered if jax.default_backend() == "gpu" else []
+
+
+def _train_together(job: Job, seeds: list[Seed], programs: Callable[[], Programs]) -> None:
+    """Trains one run, or vmapped ones, from the newest checkpoint that all of them have."""
+    with ExitStack() as stack:
+        progress: Any = processes.Silent()
+        if processes.is_first():
+            progress = stack.enter_context(console.progress(job.plan.updates))
+        say = progress.say
+        saved = kept_by_first(disk_errors()(lambda: _newest(job, seeds, say))) or []
+        known = in_first_process(lambda: _known(saved))
+        if known["update"] >= job.plan.updates:
+            for one in saved:
+                say(f"Already done: {job.plan.updates} updates. Digest {one.meta['digest']}")
+            return
+        compiled = programs()
+        times = ", ".join(f"{name} {value:.1f} s" for name, value in compiled.seconds.items())
+        say(f"Compiled: {times}")
+        for one in saved:
+            say(f"Resuming after update {one.meta['update']}. Digest {one.meta['digest']}")
+        state = _first_state(known["found"], saved, seeds, job, compiled)
+        tell_first(None if known["found"] else state.env, say)
+        writers: list[Any] = [processes.Silent(seed.checkpoints) for seed in seeds]
+        if processes.is_first():
+            with disk_errors():
+                seeds = [_note_exactness(seed, job, compiled) for seed in seeds]
+                writers = _open_writers(seeds, saved, job, say)
+            for writer in writers:
+                stack.callback(writer.close)
+                writer.loggers = open_loggers(job.options, writer.folder, known["update"], say)
+        meta = {name: known[name] for name in ("wall_s", "update")}
+        stop = processes.agreed(job.stop)
+        with program_errors():
+            loop.train(job.plan, compiled, compiled.spread(state), writers, progress, stop, meta)
+        for seed, writer in zip(seeds, writers, strict=True):
+            of = f" of {seed.path.name}" if job.options.num_seeds > 1 else ""
+            say(f"Done: {job.plan.steps:,} steps{of}. Digest {writer.digest}")
+
+
+def _newest(job: Job, seeds: list[Seed], say: Say) -> list[checkpoint.Saved]:
+    """Reads the newest checkpoint that all seeds have; [] where they begin.
+
+    Raises:
+      UserError: there were checkpoints, and none is whole.
+    """
+    folders = [seed.folder for seed in seeds if seed.folder]
+    places = [folder.checkpoints for folder in folders]
+    facts = list(map(check_manifest, folders))
+    saved = checkpoint.newest(places, job.abstract, say, owners=list(map(identity.owners, facts)))
+    if not saved:
+        promised = any(one.get("had_checkpoint") for one in facts)
+        checkpoint_folder.check_none_lost(places, promised)
+        if job.options.resume:
+            say(f"There is no checkpoint in {places[0]}: it begins anew.")
+    return saved
+
+
+def _known(saved: list[checkpoint.Saved]) -> dict[str, Any]:
+    """Returns where a run goes on, as every checkpoint says it."""
+    known = saved[0].meta if saved else {"wall_s": 0.0, "update": 0}
+    return {name: known[name] for name in ("wall_s", "update")} | {"found": bool(saved)}
+
+
+def _first_state(
+    found: bool, saved: list[checkpoint.Saved], seeds: list[Seed], job: Job, programs: Programs
+) -> TrainState:
+    """Returns the state to begin with: new, or the `saved` one that the first process has found."""
+
+    def together(trees: list[Any]) -> Any:
+        return trees[0] if len(trees) == 1 else jax.tree.map(lambda *x: jnp.stack(x), *trees)
+
+    if not found:
+        return programs.init(together([jax.random.key(seed.number) for seed in seeds]))
+    state = together([one.state for one in saved]) if saved else None
+    return processes.state_of_first(state, job.abstract)
+
+
+def _note_exactness(seed: Seed, job: Job, programs: Programs) -> Seed:
+    """Notes in manifest.json what is known only when programs are compiled."""
+    assert seed.folder
+    exactness = manifest.with_unordered(job.facts, _unordered(programs))
+    return seed._replace(folder=run_folder.note(seed.folder, **exactness))
+
+
+def _open_writers(
+    seeds: list[Seed], saved: list[checkpoint.Saved], job: Job, say: Say
+) -> list[RunWriter]:
+    """Opens what writes each seed's folder, cut back to the checkpoints `saved`."""
+    worker = ThreadPoolExecutor(1, "purerl-writer")
+    together = [seed.checkpoints for seed in seeds]
+    metas = [one.meta for one in saved] or [NO_CHECKPOINT] * len(seeds)
+    opened = []
+    for seed, meta in zip(seeds, metas, strict=True):
+        assert seed.folder and seed.lock
+        file = _open_metrics(seed.folder, meta, job.options.allow_changes, say)
+        opened.append((*file, seed.lock))
+    for place in together:
+        checkpoint_folder.forget_after(place, metas[0]["update"])
+    return [RunWriter(*one, job.options.keep, say, worker, together) for one in opened]
+
+
+def _open_metrics(
+    folder: Folder, meta: Record, allow_changes: bool, say: Say
+) -> tuple[Folder, MetricsFile]:
+    """Opens metrics.jsonl where a checkpoint left it; UserError if it is not what it was."""
+    try:
+        return folder, MetricsFile(folder.metrics, meta["metrics_bytes"], meta["metrics_sha256"])
+    except UserError:
+        if not allow_changes:
+            raise
+    change = f"{folder.metrics.name}: it was not what the run wrote; its whole lines are kept"
+    say(change)
+    place = keep_whole_lines(folder.metrics, meta["update"])
+    entry = {"after_update": meta["update"], "changes": [change]}
+    entry["fingerprint"] = folder.manifest["fingerprint"]
+    folder = run_folder.note(folder, **with_change(folder.manifest, entry))
+    return folder, MetricsFile(folder.metrics, *place)

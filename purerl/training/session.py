@@ -1,0 +1,183 @@
+"""Carries a run command out: prepares programs and folders, then lets `seeds` train.
+
+A seed's folder is a run like any other. It is read when the command begins, and once more when its
+lock is held, since another process may have been there in between.
+"""
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from purerl import exact
+from purerl.core.errors import UserError
+from purerl.core.records import PyTree
+from purerl.devices import compilation, processes
+from purerl.devices.check_sizes import check_minibatches, check_shards
+from purerl.devices.processes import in_first_process, kept_by_first
+from purerl.devices.programs import abstract_state
+from purerl.devices.shards import Shards
+from purerl.experiment import objects
+from purerl.experiment.definition import Experiment
+from purerl.experiment.loading import Source
+from purerl.experiment.objects import Setup
+from purerl.experiment.options import RunOptions
+from purerl.machine import output
+from purerl.machine.files import disk_errors
+from purerl.machine.lock import FolderLock
+from purerl.ppo.config import Config
+from purerl.ppo.learner import is_recurrent
+from purerl.runs import checkpoint, folder as run_folder, manifest
+from purerl.runs.folder import Folder, check_manifest
+from purerl.runs.resume import (
+    Description,
+    check_new_or_resume,
+    describe_config,
+    what_to_write,
+)
+from purerl.training import console
+from purerl.training.loggers import check_loggers
+from purerl.training.plan import make_plan
+from purerl.training.seeds import Job, Seed, train_all
+
+
+def execute(
+    source: Source,
+    runs: dict[Path, Experiment],
+    found: Sequence[Folder],
+    options: RunOptions,
+    stop: Callable[[], bool],
+) -> None:
+    """Prepares the folders and the programs, and trains.
+
+    Args:
+      source: where the experiment came from.
+      runs: each seed's folder, and the experiment with its overrides.
+      found: what each folder held when the command began.
+      options: the run's options.
+      stop: tells whether a signal asked to stop.
+    """
+    with processes.fail_together(), ExitStack() as stack:
+        processes.start(options.distributed)
+        experiments = list(runs.values())
+        in_first_process(lambda: check_new_or_resume(found, experiments, options.resume))
+        check_loggers(options)
+        cache = compilation.set_up_jax(options.cache)
+        job = prepare(source, experiments[0], found, options, stop)
+        seeds = begin(source, runs, job, cache, stack)
+        train_all(job, seeds)
+
+
+def prepare(
+    source: Source,
+    chosen: Experiment,
+    found: Sequence[Folder],
+    options: RunOptions,
+    stop: Callable[[], bool],
+) -> Job:
+    """Builds the experiment's objects, and says how they will be trained; arguments as above."""
+    with compilation.no_collection():
+        setup = objects.build(chosen)
+        abstract = abstract_state(*setup[:3])
+    begun_with = in_first_process(lambda: _shards_begun_with(found))
+    shards = _choose_shards(setup.config, abstract, options, begun_with)
+    objects.check_memory(setup, abstract, options.vmapped_seeds, shards.devices)
+    plan = make_plan(setup.config, chosen.evaluation, options.checkpoints, options.log_every)
+    facts = _facts(source, chosen, options, setup, shards)
+    return Job(options, chosen, setup, abstract, shards, plan, facts, stop)
+
+
+def _shards_begun_with(found: Sequence[Folder]) -> int:
+    """Returns how many shards a run was begun with, 0 if there is none yet."""
+    begun = [folder for folder in found if folder.is_begun]
+    return check_manifest(begun[0])["num_shards"] if begun else 0
+
+
+def _choose_shards(
+    config: Config, abstract: PyTree, options: RunOptions, begun_with: int
+) -> Shards:
+    """Returns the shards asked for, or those of the run that goes on, or one for each device."""
+    number, devices = options.num_shards or begun_with, jax.device_count()
+    options.check_vmapped(number)
+    number = 1 if options.vmapped_seeds > 1 else number or devices
+    if number == 1 and jax.process_count() > 1:
+        raise UserError(
+            f"num_shards is 1, which one device computes, and there are {jax.process_count()} "
+            f"processes with {devices} devices; leave out --distributed, or cut the environments "
+            f"with --num-shards {devices}."
+        )
+    shards = Shards(number, devices if number > 1 else 1)
+    try:
+        check_shards(shards, config.num_envs)
+        name = "num_envs / num_shards" if number > 1 else "num_envs"
+        check_minibatches(config, is_recurrent(abstract.carry), config.num_envs // number, name)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    return shards
+
+
+def _facts(
+    source: Source, chosen: Experiment, options: RunOptions, setup: Setup, shards: Shards
+) -> dict[str, Any]:
+    """Returns what manifest.json says of a run that begins now."""
+    builders = (chosen.build_env, chosen.build_network)
+    kernels = exact.how_chosen(jax.default_backend())
+    inexact = getattr(setup.env, "inexact", "")
+    facts = manifest.collect(setup.engine, builders, kernels, shards.number, inexact)
+    facts["model"] = objects.physics_hash(setup.env)
+    facts["experiment_file"] = str(source.path)
+    if options.vmapped_seeds > 1:
+        facts["vmapped_seeds"] = {"first": chosen.seed, "number": options.vmapped_seeds}
+    return facts
+
+
+def begin(
+    source: Source, runs: dict[Path, Experiment], job: Job, cache: str, stack: ExitStack
+) -> list[Seed]:
+    """Locks each seed's folder, reads it again, and writes down what the run is.
+
+    Args:
+      source: where the experiment came from.
+      runs: each seed's folder, and the experiment with its overrides.
+      job: what the seeds have in common.
+      cache: where compiled programs are kept, for a person.
+      stack: gives the locks back at its end.
+    """
+
+    @disk_errors()
+    def locked() -> list[Seed]:
+        locks = []
+        for path in runs:
+            locks.append(FolderLock(path))
+            stack.callback(locks[-1].close)
+        folders = [run_folder.read(path) for path in runs]  # another process may have been here
+        check_new_or_resume(folders, list(runs.values()), job.options.resume)
+        begun = any(folder.is_begun for folder in folders)
+        written = [
+            _write_down(source, folder, one, job, begun)
+            for folder, one in zip(folders, runs.values(), strict=True)
+        ]
+        for line in console.describe_plan(
+            job.plan, job.setup, job.abstract, job.facts, list(runs), cache
+        ):
+            output.say(line)
+        each = zip(runs.items(), written, locks, strict=True)
+        return [Seed(path, one.seed, folder, lock) for (path, one), folder, lock in each]
+
+    others = [Seed(path, one.seed) for path, one in runs.items()]
+    return kept_by_first(locked) or others
+
+
+def _write_down(
+    source: Source, folder: Folder, chosen: Experiment, job: Job, begun: bool
+) -> Folder:
+    """Writes what a run is, unless that is there already; returns what its folder holds then."""
+    schedule = {"log_every": job.plan.log_every, "checkpoints": job.options.checkpoints}
+    now = Description(describe_config(source, chosen, schedule), job.facts, source)
+    facts = what_to_write(folder, now, job.options.allow_changes, begun)
+    if facts is None:
+        return folder
+    checkpoint.check_fits(folder.checkpoints, job.abstract)
+    return run_folder.write(folder.path, now.config, facts, source.text)

@@ -1,0 +1,152 @@
+"""Training from Python and from the command line: both come to `train_runs`.
+
+Nothing here imports JAX before a run begins, so that XLA's flags are set in time.
+"""
+
+import dataclasses
+import os
+import platform
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from purerl.core.errors import UserError
+from purerl.devices import threads
+from purerl.exact import xla_flags
+from purerl.experiment.command_line import from_settings
+from purerl.experiment.definition import Experiment
+from purerl.experiment.loading import Source, find_source
+from purerl.experiment.options import RunOptions, check_seed
+from purerl.experiment.trust import remember
+from purerl.machine import output
+from purerl.machine.files import check_name
+from purerl.machine.signals import stop_signals
+from purerl.runs.loaded_run import Run
+
+
+def train(
+    experiment: str | Path, settings: Mapping[str, Any] | None = None, **options: Any
+) -> Run | list[Run]:
+    """Trains an experiment: the folder, bits and lines of `python -m purerl.run`.
+
+    A first SIGTERM or Ctrl-C saves and stops; a second one raises KeyboardInterrupt. A thread that
+    is not the main one receives no signals.
+
+    Args:
+      experiment: a name in experiments/, the path of a Python file, or a dotted module.
+      settings: dotted names of settings and their values, checked as on the command line.
+      options: the run command's options: name, resume, num_seeds, runs, checkpoints, ...
+
+    Returns:
+      The run, or with `num_seeds` above 1 a list of them.
+
+    Raises:
+      UserError: a name, a value or a file is wrong; the message says how to mend it.
+      RunError: the run cannot go on.
+      StoppedError: the run was asked to stop, and is saved; go on with `resume=True`.
+
+    >>> few = {"ppo.num_steps": 8192, "evaluation.number": 0}
+    >>> run = train("cartpole_swingup", few, name="first", runs=place)  # doctest: +ELLIPSIS
+    run          ...
+    >>> run.update, run.steps
+    (2, 8192)
+    """
+    if isinstance(experiment, Experiment):
+        raise UserError(
+            "A run keeps a copy of its experiment's file, and an Experiment object has none: put "
+            "it into a .py file and give train that file's path. Change its settings by settings=."
+        )
+    set_xla_flags_in_time()
+    source = find_source(str(experiment))
+    chosen, how = from_settings(source, settings or {}, options)
+    if how.video:
+        raise UserError("video is an option of the command; call `python -m purerl.render RUN`.")
+    runs = [Run(folder, trust=True) for folder in train_runs(source, chosen, how, _interrupt)]
+    return runs[0] if how.num_seeds == 1 else runs
+
+
+def train_runs(
+    source: Source, chosen: Experiment, options: RunOptions, end: Callable[[int], Any]
+) -> list[Path]:
+    """Trains an experiment of every seed; returns their folders.
+
+    Args:
+      source: where the experiment came from.
+      chosen: the experiment with its overrides.
+      options: the run's options.
+      end: called with an exit code at the second signal.
+    """
+    from purerl.runs import folder, manifest
+    from purerl.training.session import execute
+
+    check_name("The experiment's name", source.name)
+    if options.name is not None:
+        check_name("name", options.name)
+    runs = _folders(source, chosen, options)
+    remember(source.text, source.path)
+    found = [folder.read(path) for path in runs]
+    begun_portable = options.resume and any(manifest.was_portable(one.manifest) for one in found)
+    if options.portable or begun_portable:
+        set_portable_flags_in_time()
+    threads.leave_one(chosen.engine)
+    with stop_signals(end) as stop:
+        execute(source, runs, found, options, stop)
+    return list(runs)
+
+
+def _folders(source: Source, chosen: Experiment, options: RunOptions) -> dict[Path, Experiment]:
+    """Returns each seed's folder, and the experiment with that seed."""
+    runs = {}
+    for seed in range(chosen.seed, chosen.seed + options.num_seeds):
+        check_seed(seed)
+        name = options.name or f"seed{seed}"
+        if options.num_seeds > 1 and options.name:
+            name += f"-seed{seed}"
+        runs[options.runs / source.name / name] = dataclasses.replace(chosen, seed=seed)
+    return runs
+
+
+def set_xla_flags_in_time() -> None:
+    """Sets XLA's flags; where JAX runs on a GPU without them, says so and leaves them out.
+
+    Then the manifest says that the run is not bit-exact. On a CPU they change nothing.
+    """
+    if _runs_on_gpu() and xla_flags.how_chosen("gpu") == "by timing":
+        output.say(
+            "JAX has begun on the GPU with kernels chosen by timing, so this run is not bit-exact: "
+            "call purerl.exact.set_xla_flags() before JAX's first computation."
+        )
+        return
+    xla_flags.set_xla_flags()
+    kept = os.environ.get(xla_flags.KEPT_TIMINGS)
+    if "jax" in sys.modules and kept is not None:  # it read the environment when it was imported
+        sys.modules["jax"].config.update(xla_flags.KEPT_TIMINGS.lower(), kept)
+
+
+def set_portable_flags_in_time() -> None:
+    """Sets what makes bits portable; UserError where this processor or process cannot have them."""
+    from purerl.runs.manifest import processor
+
+    if not {"avx2", "fma"} <= set(processor("flags").split()):
+        raise UserError(
+            "Portable bits are those of x86-64 processors with AVX2 and FMA, and this one "
+            f"({processor('model name') or platform.machine()}) has not both; leave out --portable."
+        )
+    if threads.jax_has_begun() and not xla_flags.is_portable():
+        raise UserError(
+            "JAX has begun with other flags than portable bits need: begin a new process, or call "
+            "purerl.exact.set_portable_flags() before JAX's first computation."
+        )
+    try:
+        xla_flags.set_portable_flags()
+    except ValueError as error:
+        raise UserError(str(error)) from error
+
+
+def _runs_on_gpu() -> bool:
+    return threads.jax_has_begun() and sys.modules["jax"].default_backend() == "gpu"
+
+
+def _interrupt(code: int) -> None:
+    raise KeyboardInterrupt
