@@ -96,4 +96,5 @@ def _check_names(names: list[str], values: Any, path: str) -> None:
         if name in names:
             raise UserError(f"config.json lacks {_join(path, name)}, which the experiment has.")
         valid = [_join(path, n) for n in names]
-        raise UserError(unknown_name("setting", _join(path, name), valid))
+        what = unknown_name("setting", _join(path, name), valid)
+        raise UserError(f"config.json: {what} The code may be of another version.")

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 
 from purerl.core.errors import UserError
 from purerl.machine.files import check_object
-from purerl.ppo.config import Config
-from purerl.runs.folder import Folder, allowed_changes, read_run, runs_in
+from purerl.runs.folder import MANIFEST, Folder, allowed_changes, read_run, runs_in
 from purerl.runs.metrics_file import MAX_SKIPPED_IN_A_ROW, read_metrics
 
 NUMBER = int | float | None
@@ -98,7 +97,7 @@ def _went_on(folder: Folder) -> dict[str, Any]:
     of_none = ("source.purerl.", *(f"settings.{name}" for name in NOT_LEARNING))
     found = []
     for change in allowed_changes(folder):
-        where = f"{folder.path}: allowed_changes"
+        where = f"{folder.path / MANIFEST}: allowed_changes"
         known = check_object(where, change, after_update=int, changes=list)
         lines = [str(line) for line in known["changes"]]
         told = [x for x in lines if x.startswith(of_training) and not x.startswith(of_none)]
@@ -130,7 +129,8 @@ def _flatten(value: Any, path: str = "") -> dict[str, Any]:
 
 
 def _planned_updates(ppo: dict[str, Any]) -> int | None:
+    """Returns the updates of the whole run; settings that this version lacks do not matter."""
     try:
-        return Config(**ppo).num_updates
-    except (TypeError, ValueError, ArithmeticError):  # the settings of another version
+        return ppo["num_steps"] // (ppo["num_envs"] * ppo["rollout_length"])
+    except (TypeError, LookupError, ArithmeticError):  # the settings of another version
         return None

@@ -129,13 +129,17 @@ def test_a_setting_and_code_that_came_after_the_run_are_told(tmp_path, capsys):
     settings, facts = trained / "config.json", trained / "manifest.json"
     older = json.loads(settings.read_text())
     del older["settings"]["ppo"]["desired_kl"]
-    older["settings"]["ppo"]["segment_length"] = 4  # of training alone; the code has it no more
     settings.write_text(json.dumps(older))
     facts.write_text(json.dumps(json.loads(facts.read_text()) | {"source": {}}))
     assert result(trained, tmp_path)["update"] == 12
     said = capsys.readouterr().out
     assert "config.json lacks ppo.desired_kl; it is taken as 0.01." in said
     assert "is not that of the run any more" in said
+    older["settings"]["ppo"]["segment_length"] = 4  # the code has it no more
+    settings.write_text(json.dumps(older))
+    assert evaluate.main([str(trained)]) == USAGE
+    said = capsys.readouterr().err
+    assert "no setting 'ppo.segment_length'" in said and "of another version" in said
 
 
 def test_it_leaves_in_silence_when_its_reader_has(trained):

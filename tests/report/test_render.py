@@ -4,6 +4,8 @@ import dataclasses
 import json
 import re
 import shutil
+import sys
+import types
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -335,15 +337,14 @@ def test_without_opengl_one_line_says_what_to_install(trained, monkeypatch, caps
 
 
 def test_a_backend_that_does_not_start_says_what_to_install(monkeypatch):
-    import mujoco.osmesa
-
     class Broken:
         def __init__(self, *_):
             raise ImportError("no driver")
 
+    # In place of the module, whose import fails where another backend is in use.
+    monkeypatch.setitem(sys.modules, "mujoco.osmesa", types.SimpleNamespace(GLContext=Broken))
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
     monkeypatch.setenv("PYOPENGL_PLATFORM", "osmesa")
-    monkeypatch.setattr(mujoco.osmesa, "GLContext", Broken)
     with pytest.raises(RunError, match="osmesa .ImportError.*apt-get install libosmesa6"):
         opengl.open_gl(64, 48)
 

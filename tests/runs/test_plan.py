@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from purerl.ppo.config import Config, Evaluation
-from purerl.training.loop import evenly, make_plan
+from purerl.training.plan import evenly, make_plan
 
 UPDATES, EVERY, EVENTS = st.integers(1, 5000), st.integers(1, 300), st.integers(0, 200)
 

@@ -12,7 +12,7 @@ from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE, RunError, U
 from purerl.devices import programs
 from purerl.machine import state_arrays
 from purerl.runs import checkpoint, checkpoint_folder
-from purerl.training import console, loop, session, train, writer
+from purerl.training import console, loop, seeds, train, writer
 from tests.runs.test_run import ROOT, TOY, Stopper, digest, folder, lines, start
 
 CARTPOLE = ["--ppo.num-envs", "4", "--ppo.rollout-length", "8", "--ppo.num-steps", "128"]
@@ -49,10 +49,10 @@ def kept(runs: Path, seed: str) -> list[int]:
 
 
 def test_a_mapped_seed_that_fails_is_told_before_the_next_one(tmp_path, monkeypatch, capsys):
-    def fail(_job, _folders, seeds):
-        raise RunError("It diverged.") if seeds == [1] else UserError("Enough.")
+    def fail(_job, group, _programs):
+        raise RunError("It diverged.") if group[0].number == 1 else UserError("Enough.")
 
-    monkeypatch.setattr(session, "_train_together", fail)
+    monkeypatch.setattr(seeds, "_train_together", fail)
     assert start(tmp_path, "--num-seeds", "2", "--seeds-by", "map") == USAGE
     assert capsys.readouterr().err.splitlines() == ["purerl: It diverged.", "purerl: Enough."]
 
