@@ -24,7 +24,7 @@ class Progress(NamedTuple):
     lost: Array  # [N] bool
 
 
-def evaluate(
+def evaluate_policy(
     config: Config,
     env: Env,
     network: Network,

@@ -116,7 +116,7 @@ class Run:
 
         from purerl.core.keys import Purpose, derive
         from purerl.experiment.options import check_seed
-        from purerl.ppo.evaluation import evaluate
+        from purerl.ppo.evaluation import evaluate_policy
 
         check_seed(seed)
         if not isinstance(episodes, Integral):
@@ -126,7 +126,7 @@ class Run:
         config, env, network, engine = self.restored.setup
 
         def judge(state: Any, key: Any) -> dict[str, Any]:
-            return evaluate(config, env, network, state, key, episodes, not stochastic)
+            return evaluate_policy(config, env, network, state, key, episodes, not stochastic)
 
         def summarize(values: Any) -> dict[str, Any]:
             values = np.asarray(values, float)
