@@ -11,7 +11,7 @@ import numpy as np
 from flax import struct
 
 from purerl.core.errors import unknown_name
-from purerl.core.records import Array
+from purerl.core.records import Array, PyTree
 
 ENGINES = ("auto", "c", "jax", "warp")
 
@@ -137,7 +137,7 @@ class Physics:
 
     def init(
         self, qpos: Array, qvel: Array, changes: dict[str, Array] | None = None
-    ) -> tuple[PhysicsState, Any]:
+    ) -> tuple[PhysicsState, PyTree]:
         """Starts a simulation at qpos [nq], qvel [nv], with no activation and no control."""
         model, changes = self.model, self._check_changes(changes)
         _check_shape("qpos", qpos, (model.nq,))
@@ -156,7 +156,7 @@ class Physics:
 
     def step(
         self, state: PhysicsState, ctrl: Array, changes: dict[str, Array] | None = None
-    ) -> tuple[PhysicsState, Any]:
+    ) -> tuple[PhysicsState, PyTree]:
         """Advances one control step (`substeps` physics steps) under ctrl [nu]."""
         _check_shape("ctrl", ctrl, (self.model.nu,))
         return self._engine.step(state, _float32(ctrl), self._check_changes(changes))
@@ -206,7 +206,7 @@ def overflow_reading(engine: str) -> tuple[str, ...]:
     return ("overflow",) if choose_engine(engine) == "warp" else ()
 
 
-def overflow_metric(readings: Any) -> dict[str, Array]:
+def overflow_metric(readings: PyTree) -> dict[str, Array]:
     """Returns the metric of it, summed over an episode: control steps that lacked contacts."""
     return {"overflow_count": readings.overflow} if hasattr(readings, "overflow") else {}
 

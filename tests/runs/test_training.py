@@ -251,7 +251,7 @@ def test_a_run_from_before_the_move_is_one_line(trained, tmp_path, capsys):
     (old / "experiment.py").write_text(older)
     line = older[: older.index("purerl.config")].count("\n") + 1
     message = (
-        f"purerl: {old}/experiment.py, line {line}: purerl.config has moved, or never was: write "
+        f"purerl: {old}/experiment.py, line {line}: No module named 'purerl.config'; write "
         "`from purerl import Config`. The run was made by an older purerl: train it anew.\n"
     )
     for command in (evaluate, render, record):

@@ -148,7 +148,7 @@ def episodes(
 
 
 def results(playing: Playing) -> dict[str, np.ndarray]:
-    """Returns the figures of episodes that are over, name -> [E], as `evaluation.evaluate_policy` does."""
+    """Returns figures of episodes that are over, name -> [E], as `evaluation.evaluate_policy`."""
     progress = playing.progress
     found = rollout.episode_metrics(progress.episode) | {
         "episode_return": progress.episode.episode_return,
