@@ -51,3 +51,10 @@ def what_to_write(name: str) -> str:
     if near:
         return f"write `from purerl import {known[near[0]]}`"
     return f"the names to import from purerl are {', '.join(__all__)}"
+
+
+def how_to_install(extra: str) -> str:
+    """Returns the line to paste for an extra: at the tested versions where there is a clone."""
+    in_clone = (Path(__file__).resolve().parents[1] / "constraints.txt").is_file()
+    words = f"-c constraints.txt -e '.[{extra}]'" if in_clone else f"'purerl[{extra}]'"
+    return f"python -m pip install {words}"

@@ -54,7 +54,8 @@ from purerl.tune.plan import planner as planner  # behaviour by search, without 
 
 __version__: str
 
-# Of this list itself; the library uses them.
+# For the library itself.
 HOMES: dict[str, str]
 
 def what_to_write(name: str) -> str: ...
+def how_to_install(extra: str) -> str: ...

@@ -148,6 +148,19 @@ def test_our_packages_are_named_whole_where_the_user_has_none(tmp_path, monkeypa
         purerl.find("mine.py")
 
 
+def test_an_extra_is_installed_from_the_clone_where_there_is_one(tmp_path, monkeypatch):
+    assert purerl.how_to_install("x") == "python -m pip install -c constraints.txt -e '.[x]'"
+    monkeypatch.setattr(purerl, "__file__", str(tmp_path / "site-packages/purerl/__init__.py"))
+    assert purerl.how_to_install("x") == "python -m pip install 'purerl[x]'"
+
+
+def test_no_hint_but_that_one_says_how_to_install():
+    files = [path for path in (ROOT / "purerl").rglob("*.py") if "peers" not in path.parts]
+    found = {path.name for path in files if "pip install" in path.read_text()}
+    assert found == {"__init__.py"}
+    assert "pip install" in Path(purerl.__file__).read_text()
+
+
 def test_python_may_ask_for_a_module_that_is_not_there():
     assert importlib.util.find_spec("purerl.nothing") is None
 

@@ -13,6 +13,8 @@ A name is imported when it is first used: each needs its library. docs/howto/ada
 import importlib
 from typing import Any
 
+import purerl
+
 HOMES = {
     "gymnasium_env": "to_gymnasium",
     "gymnasium_vector_env": "to_gymnasium",
@@ -41,8 +43,7 @@ def __getattr__(name: str) -> Any:
         if extra is None:
             raise
         raise ImportError(
-            f"adapters.{name} needs {error.name}: python -m pip install -c constraints.txt "
-            f"-e '.[{extra}]'"
+            f"adapters.{name} needs {error.name}: {purerl.how_to_install(extra)}"
         ) from error
 
 

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from flax import struct
 
+import purerl
 from purerl.core.errors import unknown_name
 from purerl.core.records import Array, PyTree
 
@@ -193,8 +194,9 @@ def choose_engine(engine: str) -> str:
         raise ValueError(unknown_name("engine", engine, ENGINES))
     if engine == "warp" and importlib.util.find_spec("warp") is None:
         raise ValueError(
-            "engine 'warp' (MJX-Warp) cannot run here: it needs the warp-lang package (pip install "
-            "-c constraints.txt -e '.[warp]') and an NVIDIA GPU. Use 'jax' on a GPU, 'c' on a CPU."
+            "engine 'warp' (MJX-Warp) cannot run here: it needs the warp-lang package "
+            f"({purerl.how_to_install('warp')}) and an NVIDIA GPU. "
+            "Use 'jax' on a GPU, 'c' on a CPU."
         )
     if engine == "auto":
         return "c" if jax.default_backend() == "cpu" else "jax"
