@@ -102,6 +102,25 @@ def test_the_console_script_is_the_list_of_commands():
     assert scripts == {"purerl": "purerl.__main__:console"} and callable(commands.console)
 
 
+def test_the_console_script_finds_what_is_here_and_hides_nothing_behind_it(tmp_path):
+    (tmp_path / "mine.py").write_text("import beside\nfrom purerl import networks\n")
+    (tmp_path / "beside.py").write_text("print('beside is found')\n")
+    for decoy in ("typing_extensions", "rich", "jax", "statistics"):  # what is imported later
+        (tmp_path / decoy).mkdir()
+        (tmp_path / decoy / "__init__.py").write_text("raise SystemExit('the decoy')\n")
+    code = "import sys; from purerl.__main__ import console; sys.argv[0] = 'purerl'; console()"
+    words = [sys.executable, "-P", "-c", code, "run", "mine.py"]  # -P: as a script in bin/ begins
+    path = str(ROOT)
+    there = os.environ | {"PYTHONPATH": path}
+    done = subprocess.run(words, cwd=tmp_path, env=there, capture_output=True, text=True)
+    assert done.stdout == "beside is found\n"
+    assert (
+        done.stderr
+        == f"purerl: {tmp_path}/mine.py defines no `experiment = Experiment(...)` "
+        + ("(it is None).\n")
+    )
+
+
 @pytest.mark.parametrize(
     ("line", "said", "hint"),
     [
