@@ -15,14 +15,14 @@ from typing import Any
 __version__ = "0.2.0"
 
 
-def _listed(stub: Path) -> dict[str, str]:
-    """Returns what a stub imports, name -> module, without importing anything."""
-    nodes = ast.parse(stub.read_bytes()).body
+def listed(file: str) -> dict[str, str]:
+    """Returns what the stub beside an `__init__.py` imports, name -> module, importing nothing."""
+    nodes = ast.parse(Path(file).with_suffix(".pyi").read_bytes()).body
     lines = [node for node in nodes if isinstance(node, ast.ImportFrom)]
     return {alias.name: str(line.module) for line in lines for alias in line.names}
 
 
-HOMES = _listed(Path(__file__).with_suffix(".pyi"))
+HOMES = listed(__file__)
 __all__ = sorted(HOMES)
 
 

@@ -47,9 +47,12 @@ def test_each_name_of_the_stub_is_what_its_line_imports():
 
 def test_type_checkers_take_each_line_of_the_stub_for_public():
     """They do if a name is imported as itself."""
-    for node in ast.parse(Path(purerl.__file__).with_suffix(".pyi").read_text()).body:
-        for alias in node.names if isinstance(node, ast.ImportFrom) else ():
-            assert alias.asname == alias.name
+    for package in (purerl, purerl.adapters, purerl.exact):
+        tree = ast.parse(Path(package.__file__).with_suffix(".pyi").read_text())
+        lines = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+        names = {alias.name: alias.asname for line in lines for alias in line.names}
+        assert all(name == its_name for name, its_name in names.items())
+        assert sorted(names) == package.__all__
 
 
 def test_a_public_name_is_no_other_module():

@@ -103,6 +103,10 @@ reveal_type(purerl.update(config, env, network, state))  # tuple[TrainState, dic
 purerl.init(config, NoStep(), network, key)  # wrong
 purerl.update(config, env, state, network)  # wrong
 reveal_type(purerl.choose_engine("auto"))  # str
+reveal_type(purerl.exact.is_portable())  # bool
+purerl.exact.rewrit  # wrong
+purerl.adapters.dm_env_environment(network)  # wrong
+purerl.adapters.gym_env  # wrong
 '''
 # What is of a type that only its writer knows, or of many.
 OF_ANY_TYPE = {

@@ -203,7 +203,10 @@ def names_are_free(place: Place, here: Path) -> Iterator[str]:
     """Checks that names of the clone's folders are nobody's, or those of the user's folder."""
     for name in OTHERS:
         done = attempt(place, here, place.python, "-c", f"import {name}")
-        need(f"No module named '{name}'" in done.stderr, f"`import {name}`: {done.stderr}")
+        need(
+            f"No module named '{name}'" in done.stderr,
+            f"`import {name}` finds a module: {done.stderr}",
+        )
     (here / "envs").mkdir()
     (here / "envs" / "mine.py").write_text('WHOSE = "mine"\n')
     said = call(
