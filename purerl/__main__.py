@@ -38,8 +38,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def console() -> None:
-    """Runs the console script `purerl`, which finds modules where it is called, as `-m` does."""
-    sys.path.insert(0, "")
+    """Runs the console script `purerl`, which finds modules where it is called.
+
+    It looks there last: whatever a folder has, this library finds Python's and its own packages.
+    """
+    sys.path.append("")
     leave(main)
 
 

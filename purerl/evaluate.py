@@ -7,13 +7,16 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from purerl.experiment.command_line import carry_out
 from purerl.experiment.options import PlayOptions
 from purerl.machine.command_errors import leave
 from purerl.machine.files import check_writable, write_answer
 from purerl.machine.output import show
+
+if TYPE_CHECKING:
+    from purerl.runs.loaded_run import Evaluated
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ def command(options: EvaluateOptions) -> None:
         write_answer(file, (json.dumps(result, indent=2) + "\n").encode())
 
 
-def describe(result: dict[str, Any]) -> list[str]:
+def describe(result: "Evaluated") -> list[str]:
     """Returns the result as lines for a person, the return first."""
     ordered = {"episode_return": result["metrics"]["episode_return"]} | result["metrics"]
     width = max(map(len, ordered))

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import purerl
 from purerl.core.errors import UserError
 from purerl.experiment.command_line import carry_out
 from purerl.experiment.options import PlayOptions
@@ -60,8 +61,7 @@ def writer(name: str) -> Any:
     missing = [package for package in NEEDS[name] if importlib.util.find_spec(package) is None]
     if missing:
         raise UserError(
-            f"--format {name} needs {', '.join(missing)}: python -m pip install -c constraints.txt "
-            "-e '.[export]'"
+            f"--format {name} needs {', '.join(missing)}: {purerl.how_to_install('export')}"
         )
     return getattr(importlib.import_module(f"purerl.report.policy_{name}"), f"write_{name}")
 

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import purerl
 from purerl.core.errors import UserError
 from purerl.machine.command_errors import leave
 from purerl.machine.output import show
@@ -50,9 +51,7 @@ def command(words: Sequence[str]) -> None:
     found = find(words, PROG)
     chosen, options = settings_of(found, words[1:], f"{PROG} {found.name}", ViewOptions)
     if not has_viser():  # its help needs no window
-        raise UserError(
-            "The window needs the package viser: pip install -c constraints.txt -e '.[view]'."
-        )
+        raise UserError(f"The window needs the package viser: {purerl.how_to_install('view')}")
     from purerl.tune.view import opening
     from purerl.tune.view.loop import check_port, play
     from purerl.tune.view.page import Page

@@ -1,6 +1,7 @@
 """`import purerl`: the names that users get, and what imports only them."""
 
 import ast
+import importlib.util
 import inspect
 import os
 import re
@@ -15,15 +16,9 @@ import purerl
 from purerl import __main__ as commands
 
 ROOT = Path(__file__).parent.parent
-NAMES = [
-    "Array", "Config", "Env", "EnvError", "Evaluation", "Experiment", "Network", "Normal",
-    "Physics", "PhysicsState", "Policy", "PolicyOutput", "PyTree", "Run", "RunError", "State",
-    "StoppedError", "UserError", "adapters", "check_env", "choose_engine", "exact", "find",
-    "load", "lookup", "networks", "overflow_metric", "overflow_reading", "planner",
-    "train",
-]  # fmt: skip
 MODULES = {"adapters", "exact", "lookup", "networks", "planner"}
 BESIDE = ("purerl.envs", "purerl.experiments")  # of this repository, as these files themselves
+NAMES = purerl.__all__
 # They measure the insides.
 INSIDERS = {"benchmarks", "peers"}
 
@@ -35,29 +30,37 @@ def fresh(code: str) -> str:
     return done.stdout
 
 
-def test_these_are_the_public_names():
-    assert purerl.__all__ == sorted(NAMES)
+def test_each_name_of_the_stub_is_what_its_line_imports():
+    assert {"train", "Run", "Config", "check_env", "init", "update", "TrainState"} < set(NAMES)
     assert set(NAMES) <= set(dir(purerl))
+    # Each in a process that has not imported it: one name may bring another's module.
+    code = "import sys, purerl; print(type(getattr(purerl, sys.argv[1])).__name__)"
     for name in NAMES:
-        assert inspect.ismodule(getattr(purerl, name)) == (name in MODULES), name
-        assert re.search(rf"^  [^:]*\b{name}\b", str(purerl.__doc__), re.MULTILINE), name
+        said: dict = {}
+        exec(f"from {purerl.HOMES[name]} import {name}", said)
+        assert getattr(purerl, name) is said[name], name
+        assert inspect.ismodule(said[name]) == (name in MODULES), name
+    for name in ("lookup", "planner", "adapters"):
+        done = subprocess.run([sys.executable, "-c", code, name], capture_output=True, text=True)
+        assert done.stdout == "module\n", done.stderr
 
 
-def test_editors_know_the_same_names_from_the_same_modules():
-    said = {}
-    for node in ast.parse(Path(purerl.__file__).with_suffix(".pyi").read_text()).body:
-        for alias in node.names if isinstance(node, ast.ImportFrom) else ():
-            is_module = alias.name in MODULES
-            assert alias.asname == alias.name  # or type checkers take it for private
-            said[alias.name] = f"{node.module}.{alias.name}" if is_module else node.module
-    assert said == purerl.HOMES
+def test_type_checkers_take_each_line_of_the_stub_for_public():
+    """They do if a name is imported as itself."""
+    for package in (purerl, purerl.adapters, purerl.exact):
+        tree = ast.parse(Path(package.__file__).with_suffix(".pyi").read_text())
+        lines = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+        names = {alias.name: alias.asname for line in lines for alias in line.names}
+        assert all(name == its_name for name, its_name in names.items())
+        assert sorted(names) == package.__all__
 
 
 def test_a_public_name_is_no_other_module():
+    """Or importing that module, as the command `evaluate`, would take the name's place."""
     for name in NAMES:
         place = ROOT / "purerl" / name
         if place.is_dir() or place.with_suffix(".py").exists():
-            assert purerl.HOMES[name] == f"purerl.{name}"
+            assert purerl.HOMES[name] == "purerl"
 
 
 def test_importing_it_is_quick_and_starts_no_jax():
@@ -102,21 +105,86 @@ def test_the_console_script_is_the_list_of_commands():
     assert scripts == {"purerl": "purerl.__main__:console"} and callable(commands.console)
 
 
+def test_the_console_script_finds_what_is_here_and_hides_nothing_behind_it(tmp_path):
+    (tmp_path / "mine.py").write_text("import beside\nfrom purerl import networks\n")
+    (tmp_path / "beside.py").write_text("print('beside is found')\n")
+    for decoy in ("typing_extensions", "rich", "jax", "statistics"):  # what is imported later
+        (tmp_path / decoy).mkdir()
+        (tmp_path / decoy / "__init__.py").write_text("raise SystemExit('the decoy')\n")
+    code = "import sys; from purerl.__main__ import console; sys.argv[0] = 'purerl'; console()"
+    words = [sys.executable, "-P", "-c", code, "run", "mine.py"]  # -P: as a script in bin/ begins
+    path = str(ROOT)
+    there = os.environ | {"PYTHONPATH": path}
+    done = subprocess.run(words, cwd=tmp_path, env=there, capture_output=True, text=True)
+    assert done.stdout == "beside is found\n"
+    assert (
+        done.stderr
+        == f"purerl: {tmp_path}/mine.py defines no `experiment = Experiment(...)` "
+        + ("(it is None).\n")
+    )
+
+
 @pytest.mark.parametrize(
-    ("line", "message"),
+    ("line", "said", "hint"),
     [
-        ("from purerl.config import Config", "write `from purerl import Config`."),
-        ("import purerl.experiment", "write `from purerl import Experiment`."),
-        ("from purerl.env import State", "write `from purerl import Env`."),
-        ("from purerl.physics import Physics", "write `from purerl import Physics`."),
-        ("from purerl.types import Array", "the names to import from purerl are Array, Config"),
-        ("from purerl import Confg", "write `from purerl import Config`."),
+        ("from purerl.config import Config", "No module named 'purerl.config'", "Config"),
+        ("import purerl.lookups", "No module named 'purerl.lookups'", "lookup"),
+        ("from purerl.env import State", "No module named 'purerl.env'", "Env"),
+        ("from purerl.physics import Physics", "name 'Physics' from 'purerl.physics'", "Physics"),
+        ("from purerl import Confg", "cannot import name 'Confg' from 'purerl'", "Config"),
+        ("from purerl.ppo.config import Confg", "name 'Confg' from 'purerl.ppo.config'", "Config"),
     ],
 )
-def test_an_import_that_moved_is_one_line_that_says_what_to_write(line, message):
-    with pytest.raises(ModuleNotFoundError, match="has moved, or never was: ") as error:
+def test_a_wrong_import_in_a_file_that_is_loaded_says_what_to_write(tmp_path, line, said, hint):
+    """In plain Python it brings the ImportError of Python's own."""
+    with pytest.raises(ImportError, match=said):
         exec(line)
-    assert message in str(error.value) and "\n" not in str(error.value)
+    (tmp_path / "mine.py").write_text(f"# mine\n{line}\n")
+    with pytest.raises(purerl.UserError) as error:
+        purerl.find(str(tmp_path / "mine.py"))
+    told = f"{tmp_path}/mine.py, line 2: "
+    assert str(error.value).startswith(told) and said in str(error.value)
+    assert str(error.value).endswith(f"; write `from purerl import {hint}`")
+
+
+def test_what_is_like_no_name_brings_the_list_of_names(tmp_path):
+    (tmp_path / "mine.py").write_text("from purerl.typing import Tensor\n")
+    with pytest.raises(purerl.UserError, match="names to import from purerl are Array, Config, "):
+        purerl.find(str(tmp_path / "mine.py"))
+
+
+@pytest.mark.parametrize("package", ["envs", "experiments"])
+def test_our_packages_are_named_whole_where_the_user_has_none(tmp_path, monkeypatch, package):
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if p not in ("", str(ROOT))])
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, package, raising=False)
+    (tmp_path / "mine.py").write_text(f"from {package} import cartpole_swingup\n")
+    with pytest.raises(purerl.UserError) as error:
+        purerl.find("mine.py")
+    assert str(error.value).endswith(
+        f"No module named '{package}'; write `from purerl.{package} import ...`"
+    )
+    (tmp_path / package).mkdir()  # theirs
+    (tmp_path / package / "__init__.py").touch()
+    with pytest.raises(purerl.UserError, match=f"set PYTHONPATH={tmp_path}$"):
+        purerl.find("mine.py")
+
+
+def test_an_extra_is_installed_from_the_clone_where_there_is_one(tmp_path, monkeypatch):
+    assert purerl.how_to_install("x") == "python -m pip install -c constraints.txt -e '.[x]'"
+    monkeypatch.setattr(purerl, "__file__", str(tmp_path / "site-packages/purerl/__init__.py"))
+    assert purerl.how_to_install("x") == "python -m pip install 'purerl[x]'"
+
+
+def test_no_hint_but_that_one_says_how_to_install():
+    files = [path for path in (ROOT / "purerl").rglob("*.py") if "peers" not in path.parts]
+    found = {path.name for path in files if "pip install" in path.read_text()}
+    assert found == {"__init__.py"}
+    assert "pip install" in Path(purerl.__file__).read_text()
+
+
+def test_python_may_ask_for_a_module_that_is_not_there():
+    assert importlib.util.find_spec("purerl.nothing") is None
 
 
 def test_a_wrong_attribute_is_told_with_the_nearest():

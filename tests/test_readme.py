@@ -149,8 +149,6 @@ def test_every_link_of_a_page_leads_somewhere(page):
 
 
 def test_python_blocks_import_the_front_door_alone(page):
-    if page.name == "own_loop.md":  # it is about what is behind the door, and says so
-        return
     for block in blocks(page.read_text(), "python"):
         for node in ast.walk(ast.parse(block)):
             if isinstance(node, ast.ImportFrom) and node.module.startswith("purerl.envs"):

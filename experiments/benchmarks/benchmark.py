@@ -40,7 +40,7 @@ from purerl.experiments.benchmarks.output import count, output_file
 from purerl.machine.command_errors import leave
 from purerl.physics.lookup import scale_action
 from purerl.ppo import algorithm, learner
-from purerl.ppo.evaluation import evaluate
+from purerl.ppo.evaluation import evaluate_policy
 from purerl.ppo.rollout import rollout
 from purerl.training.console import size
 
@@ -113,7 +113,7 @@ def make_bench(experiment: Experiment, names: Sequence[str] = PARTS) -> Bench:
         ("update", partial(algorithm.update, config, env, network), (state,), steps),
         (
             "evaluation",
-            partial(evaluate, config, env, network, num_episodes=episodes),
+            partial(evaluate_policy, config, env, network, num_episodes=episodes),
             (state, key),
             None,
         ),

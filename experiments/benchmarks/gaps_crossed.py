@@ -24,7 +24,7 @@ from purerl.core.records import Array, Network, Normal, PolicyOutput, TrainState
 from purerl.devices.compilation import set_up_jax
 from purerl.experiment import objects
 from purerl.machine.command_errors import leave
-from purerl.ppo.evaluation import evaluate
+from purerl.ppo.evaluation import evaluate_policy
 from purerl.runs import restored_run
 
 
@@ -32,7 +32,7 @@ def gaps_of(setup: objects.Setup, state: TrainState, seed: int, episodes: int) -
     """Evaluates deterministically in `episodes` corridors; the same seed gives the same ones."""
 
     def judge(state: TrainState, key: Array) -> dict[str, Array]:
-        return evaluate(setup.config, setup.env, setup.network, state, key, episodes)
+        return evaluate_policy(setup.config, setup.env, setup.network, state, key, episodes)
 
     key = derive(jax.random.key(seed), Purpose.EVALUATION)
     return jax.device_get(jax.jit(judge)(state, key))

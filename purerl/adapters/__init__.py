@@ -13,18 +13,9 @@ A name is imported when it is first used: each needs its library. docs/howto/ada
 import importlib
 from typing import Any
 
-HOMES = {
-    "gymnasium_env": "to_gymnasium",
-    "gymnasium_vector_env": "to_gymnasium",
-    "dm_env_environment": "to_dm_env",
-    "GymnasiumOptions": "gymnasium_envs",
-    "from_gymnasium": "gymnasium_envs",
-    "from_maker": "gymnasium_envs",
-    "BraxOptions": "brax_envs",
-    "from_brax": "brax_envs",
-    "PlaygroundOptions": "playground_envs",
-    "from_playground": "playground_envs",
-}
+import purerl
+
+HOMES = purerl.listed(__file__)
 # Library -> the extra that brings it.
 _EXTRAS = {"gymnasium": "gymnasium", "brax": "brax", "mujoco_playground": "playground"}
 __all__ = sorted(HOMES)
@@ -35,14 +26,13 @@ def __getattr__(name: str) -> Any:
     if name not in HOMES:
         raise AttributeError(f"purerl.adapters has no {name!r}; it has {', '.join(__all__)}.")
     try:
-        return getattr(importlib.import_module(f"{__name__}.{HOMES[name]}"), name)
+        return getattr(importlib.import_module(HOMES[name]), name)
     except ModuleNotFoundError as error:
         extra = _EXTRAS.get((error.name or "").partition(".")[0])
         if extra is None:
             raise
         raise ImportError(
-            f"adapters.{name} needs {error.name}: python -m pip install -c constraints.txt "
-            f"-e '.[{extra}]'"
+            f"adapters.{name} needs {error.name}: {purerl.how_to_install(extra)}"
         ) from error
 
 

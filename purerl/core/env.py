@@ -3,7 +3,7 @@
 `purerl.check_env` checks that an environment keeps to it.
 """
 
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from flax import struct
 
@@ -36,16 +36,21 @@ class State(struct.PyTreeNode):
 class Env(Protocol):
     """One environment; batching, time limit and autoreset are the caller's."""
 
-    control_timestep: float  # simulated seconds for one step [s]
-    action_size: int
+    if TYPE_CHECKING:  # read-only, so that a constant, a field and a property all fit
+
+        @property
+        def control_timestep(self) -> float:
+            """Simulated seconds for one step [s]."""
+
+        @property
+        def action_size(self) -> int:
+            """Features of an action, A."""
 
     def reset(self, key: Array) -> State:
         """Starts an episode; a pure function of a typed key []."""
-        ...
 
     def step(self, state: State, action: Array) -> State:
         """Advances one control step; pure; `action` [A] in [-1, 1]."""
-        ...
 
 
 class EnvError(ValueError):

@@ -29,7 +29,7 @@ from purerl.devices.compilation import (
 from purerl.devices.shards import Shards, improve
 from purerl.ppo import algorithm
 from purerl.ppo.config import Config, Evaluation
-from purerl.ppo.evaluation import evaluate
+from purerl.ppo.evaluation import evaluate_policy
 
 
 class Programs(NamedTuple):
@@ -112,7 +112,7 @@ def evaluate_in_run(
 ) -> Metrics:
     """Evaluates the deterministic policy on episodes that depend on seed and update alone."""
     key = derive(state.key, Purpose.EVALUATION, state.update)
-    return evaluate(config, env, network, state, key, num_episodes)
+    return evaluate_policy(config, env, network, state, key, num_episodes)
 
 
 def compile_update(

@@ -11,18 +11,17 @@ and `fuse.py`, the optimisation. `portable.py` has the rules for a CPU. `xla_fla
 import importlib
 from typing import Any
 
+import purerl
+
 # Imported when they are asked for: `set_xla_flags` has to be called before JAX starts.
-_PUBLIC = dict.fromkeys(("unordered_sums", "unordered_in", "ScatterSum"), "order")
-_PUBLIC |= dict.fromkeys(("set_xla_flags", "how_chosen", "equal_passes"), "xla_flags")
-_PUBLIC |= dict.fromkeys(("set_portable_flags", "is_portable"), "xla_flags")
-_PUBLIC |= {"rewrite": "rewriting", "without_libraries": "portable"}
-__all__ = sorted(_PUBLIC)
+HOMES = purerl.listed(__file__)
+__all__ = sorted(HOMES)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _PUBLIC:
+    if name not in HOMES:
         raise AttributeError(f"purerl.exact has no {name!r}; it has {', '.join(__all__)}.")
-    return getattr(importlib.import_module(f"{__name__}.{_PUBLIC[name]}"), name)
+    return getattr(importlib.import_module(HOMES[name]), name)
 
 
 def __dir__() -> list[str]:

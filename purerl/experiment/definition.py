@@ -5,12 +5,18 @@ Nothing heavy is imported here, so that a list of experiments or a help page com
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from purerl.experiment.options import Engine
 from purerl.ppo.config import Config, Evaluation
+
+if TYPE_CHECKING:
+    from purerl.core.env import Env
+    from purerl.core.records import Network, PyTree
+else:  # the annotations are evaluated, to check settings, and these would import JAX
+    Env = Network = PyTree = Any
 
 
 @dataclass(frozen=True)
@@ -22,9 +28,9 @@ class Experiment:
     be overridden on the command line: `--ppo.learning-rate 1e-3 --env.forward-weight 2`.
     """
 
-    build_env: Callable[[Any, str], Any]
+    build_env: Callable[[Any, str], Env]
     env: Any
-    build_network: Callable[[Any, Any, int], Any]
+    build_network: Callable[[Any, PyTree, int], Network]
     network: Any
     ppo: Config
     seed: Annotated[int, tyro.conf.arg(help="Seed of everything random in the run.")] = 1

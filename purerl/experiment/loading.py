@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import purerl
 from purerl.core.errors import UserError, one_line, unknown_name
 from purerl.experiment.definition import Experiment
 from purerl.experiment.kinds import suggest_field, wrong_value
@@ -17,6 +18,7 @@ from purerl.experiment.settings_json import has_settings, to_json
 from purerl.machine.files import read_bytes
 from purerl.ppo.config import Config, Evaluation
 
+OURS_BESIDE = ("envs", "experiments")  # packages of ours; without `purerl.`, a person's own
 # The library's own experiments: in a clone the folder beside `purerl/`, where a link leads.
 OURS = (Path(__file__).parents[1] / "experiments").resolve()
 
@@ -166,14 +168,26 @@ def _mistakes(file: str, place: Path) -> Iterator[None]:
     except Exception as error:
         lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == file]
         where = f", line {lines[-1]}" if lines else ""
-        missing = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
-        beside, hint = place.parent / missing.partition(".")[0], ""
-        if missing == "purerl":
-            of_run = (Path(file).parent / "config.json").exists()
-            hint = " The run was made by an older purerl: train it anew." if of_run else ""
-        elif missing and (beside.is_dir() or beside.with_suffix(".py").exists()):
-            hint = f"; it stands beside the file: set PYTHONPATH={place.parent}"
-        elif missing:
-            hint = "; install it, or correct its name"
+        hint = _import_hint(error, place) if isinstance(error, ImportError) else ""
+        if "from purerl" in hint and (Path(file).parent / "config.json").exists():
+            hint += ". The run was made by an older purerl: train it anew."
         hint = hint or suggest_field(str(error), Config, Evaluation, Experiment)
-        raise UserError(f"{file}{where}: {one_line(error)}{hint}") from error
+        said = re.sub(r"('purerl[.\w]*') \(.*\)$", r"\1", one_line(error))
+        raise UserError(f"{file}{where}: {said}{hint}") from error
+
+
+def _import_hint(error: ImportError, place: Path) -> str:
+    """Returns what helps after an import that failed; `place` is the file that asked for it."""
+    module = error.name or ""
+    first, _, inside = module.partition(".")
+    name = re.search(r"cannot import name '(\w+)'", str(error))
+    beside = place.parent / first
+    if first == "purerl" and inside.partition(".")[0] not in OURS_BESIDE:
+        return f"; {purerl.what_to_write(name[1] if name else module.rpartition('.')[2])}"
+    if name or not module:
+        return ""
+    if beside.is_dir() or beside.with_suffix(".py").exists():
+        return f"; it stands beside the file: set PYTHONPATH={place.parent}"
+    if first in OURS_BESIDE:
+        return f"; write `from purerl.{module} import ...`"
+    return "; install it, or correct its name"

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypedDict
 
 import tyro
 
@@ -99,3 +99,29 @@ class RunOptions:
                 f"num_shards is {number}, and {self.num_seeds} vmapped seeds share one program "
                 "on one device; use --seeds-by map, or leave out --num-shards."
             )
+
+
+class TrainOptions(TypedDict, total=False):
+    """`RunOptions` as keyword arguments of `train`, for type checkers; a test compares the two.
+
+    `num_seeds` is not among them, for `train` returns another type with it; nor is `video`, which
+    is the command's alone. `seed` and `engine` are settings that every experiment has.
+    """
+
+    seed: int
+    engine: Engine
+    name: str | None
+    seeds_by: Literal["vmap", "map"]
+    num_shards: int
+    distributed: str
+    portable: bool
+    resume: bool
+    allow_changes: bool
+    runs: str | Path
+    log_every: int
+    checkpoints: int
+    keep: int
+    tensorboard: bool
+    wandb: Literal["off", "online", "offline"]
+    wandb_project: str
+    cache: bool

@@ -10,8 +10,9 @@ import mujoco
 import numpy as np
 from flax import struct
 
+import purerl
 from purerl.core.errors import unknown_name
-from purerl.core.records import Array
+from purerl.core.records import Array, PyTree
 
 ENGINES = ("auto", "c", "jax", "warp")
 
@@ -137,7 +138,7 @@ class Physics:
 
     def init(
         self, qpos: Array, qvel: Array, changes: dict[str, Array] | None = None
-    ) -> tuple[PhysicsState, Any]:
+    ) -> tuple[PhysicsState, PyTree]:
         """Starts a simulation at qpos [nq], qvel [nv], with no activation and no control."""
         model, changes = self.model, self._check_changes(changes)
         _check_shape("qpos", qpos, (model.nq,))
@@ -156,7 +157,7 @@ class Physics:
 
     def step(
         self, state: PhysicsState, ctrl: Array, changes: dict[str, Array] | None = None
-    ) -> tuple[PhysicsState, Any]:
+    ) -> tuple[PhysicsState, PyTree]:
         """Advances one control step (`substeps` physics steps) under ctrl [nu]."""
         _check_shape("ctrl", ctrl, (self.model.nu,))
         return self._engine.step(state, _float32(ctrl), self._check_changes(changes))
@@ -193,8 +194,9 @@ def choose_engine(engine: str) -> str:
         raise ValueError(unknown_name("engine", engine, ENGINES))
     if engine == "warp" and importlib.util.find_spec("warp") is None:
         raise ValueError(
-            "engine 'warp' (MJX-Warp) cannot run here: it needs the warp-lang package (pip install "
-            "-c constraints.txt -e '.[warp]') and an NVIDIA GPU. Use 'jax' on a GPU, 'c' on a CPU."
+            "engine 'warp' (MJX-Warp) cannot run here: it needs the warp-lang package "
+            f"({purerl.how_to_install('warp')}) and an NVIDIA GPU. "
+            "Use 'jax' on a GPU, 'c' on a CPU."
         )
     if engine == "auto":
         return "c" if jax.default_backend() == "cpu" else "jax"
@@ -206,7 +208,7 @@ def overflow_reading(engine: str) -> tuple[str, ...]:
     return ("overflow",) if choose_engine(engine) == "warp" else ()
 
 
-def overflow_metric(readings: Any) -> dict[str, Array]:
+def overflow_metric(readings: PyTree) -> dict[str, Array]:
     """Returns the metric of it, summed over an episode: control steps that lacked contacts."""
     return {"overflow_count": readings.overflow} if hasattr(readings, "overflow") else {}
 

@@ -40,6 +40,16 @@ def init(config: Config, env: Env, network: Network, key: Array) -> TrainState:
 
     The first episodes' time limits are uniform in 1 to the environment's own, so that environments
     do not stay in phase: B environments all at the same moment of an episode are one sample.
+
+    >>> env = purerl.envs.cartpole_swingup.build()
+    >>> config = purerl.Config(num_steps=8192, num_envs=8, rollout_length=32, num_minibatches=4)
+    >>> observation = env.reset(jax.random.key(0)).observation
+    >>> options = purerl.networks.MlpOptions()
+    >>> network = purerl.networks.mlp(options, observation, env.action_size)
+    >>> begin = jax.jit(functools.partial(purerl.init, config, env, network))
+    >>> state = begin(jax.random.key(1))
+    >>> int(state.update), state.discounted_return.shape
+    (0, (8,))
     """
     params, carry = network.init(derive(key, Purpose.PARAMETERS))
     size, number = config.num_envs, jnp.arange(config.num_envs, dtype=jnp.int32)
@@ -74,6 +84,11 @@ def update(
     Returns:
       The next state, and metrics, name -> [] float32. Observation and return statistics stay as
       they are until the end, so that the first policy ratio is exactly 1.
+
+    >>> step = jax.jit(functools.partial(purerl.update, config, env, network))  # those of `init`
+    >>> state, metrics = step(state)
+    >>> int(state.update), metrics["reward"].shape
+    (1, ())
     """
     state, experience = collect(config, env, network, state)
     return improve(config, network, state, experience)

@@ -24,7 +24,7 @@ class Progress(NamedTuple):
     lost: Array  # [N] bool
 
 
-def evaluate(
+def evaluate_policy(
     config: Config,
     env: Env,
     network: Network,
@@ -42,6 +42,10 @@ def evaluate(
     Returns:
       "episode_return", "episode_length" and every metric of the environment, name -> [N], and
       "lost" [N], 1 for an episode that ended because its state was no longer finite.
+
+    >>> judge = functools.partial(purerl.evaluate_policy, config, env, network, num_episodes=4)
+    >>> jax.jit(judge)(state, jax.random.key(2))["episode_return"].shape
+    (4,)
     """
     reset_key, action_key = jax.random.split(key)
 

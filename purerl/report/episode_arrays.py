@@ -82,7 +82,7 @@ def record(setup: Setup, state: TrainState, seed: int, number: int) -> Leaves:
       seed: of the episodes.
       number: N.
     """
-    # As `evaluation.evaluate` does: the same beginnings.
+    # As `evaluation.evaluate_policy` does: the same beginnings.
     key, _ = jax.random.split(derive(jax.random.key(seed), Purpose.EVALUATION))
     played = jax.jit(lambda s, key: play(setup, s, key, number, setup.config.episode_length)[1])
     rows = played(state, key)

@@ -3,15 +3,18 @@
 import functools
 from dataclasses import dataclass
 from numbers import Integral
-from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from purerl.core.errors import UserError
 from purerl.runs.folder import METRICS, check_is_run
 from purerl.runs.metrics_file import read_metrics
 
 if TYPE_CHECKING:
+    from purerl.core.env import Env
+    from purerl.core.records import Network, TrainState
+    from purerl.experiment.definition import Experiment
+    from purerl.ppo.config import Config
     from purerl.runs import restored_run
     from purerl.runs.policy import Policy
 
@@ -45,9 +48,28 @@ def load(
     return Run(folder, str(checkpoint), engine, trust)
 
 
-def _saved_as(name: str, doc: str) -> property:
-    """Returns a property: what the checkpoint says of itself by that name."""
-    return property(lambda self: self.restored.saved.meta[name], doc=doc)
+class Figures(TypedDict):
+    """One metric over N episodes."""
+
+    mean: float
+    std: float
+    min: float
+    max: float
+    values: list[float]
+
+
+class Evaluated(TypedDict):
+    """What `Run.evaluate` returns: what was evaluated, and the figures."""
+
+    run: str
+    update: int
+    steps: int
+    digest: str
+    engine: str
+    seed: int
+    policy: str
+    episodes: int
+    metrics: dict[str, Figures]
 
 
 @dataclass(frozen=True)
@@ -76,17 +98,45 @@ class Run:
 
         return Policy(self.env, self.network, self.state)
 
-    experiment = property(attrgetter("restored.experiment"), doc="With the run's settings.")
-    config = property(attrgetter("restored.setup.config"), doc="The settings of PPO.")
-    env = property(attrgetter("restored.setup.env"), doc="One environment.")
-    network = property(attrgetter("restored.setup.network"), doc="The network's functions.")
-    state = property(
-        attrgetter("restored.saved.state"),
-        doc="The checkpoint's TrainState, without environments, episodes and optimizer.",
-    )
-    update = _saved_as("update", "Updates done.")
-    steps = _saved_as("steps", "Control steps taken, all environments together.")
-    digest = _saved_as("digest", "The sha256 of the whole state that was saved.")
+    @property
+    def experiment(self) -> "Experiment":
+        """With the run's settings."""
+        return self.restored.experiment
+
+    @property
+    def config(self) -> "Config":
+        """The settings of PPO."""
+        return self.restored.setup.config
+
+    @property
+    def env(self) -> "Env":
+        """One environment."""
+        return self.restored.setup.env
+
+    @property
+    def network(self) -> "Network":
+        """The network's functions."""
+        return self.restored.setup.network
+
+    @property
+    def state(self) -> "TrainState":
+        """The checkpoint's, without environments, episodes and optimizer."""
+        return self.restored.saved.state
+
+    @property
+    def update(self) -> int:
+        """Updates done."""
+        return self.restored.saved.meta["update"]
+
+    @property
+    def steps(self) -> int:
+        """Control steps taken, all environments together."""
+        return self.restored.saved.meta["steps"]
+
+    @property
+    def digest(self) -> str:
+        """The sha256 of the whole state that was saved."""
+        return self.restored.saved.meta["digest"]
 
     def metrics(self) -> dict[str, list[Any]]:
         """Returns metrics.jsonl as columns, None where a line lacks one; JAX is not needed.
@@ -97,9 +147,7 @@ class Run:
         names = dict.fromkeys(name for line in lines for name in line)
         return {name: [line.get(name) for line in lines] for name in names}
 
-    def evaluate(
-        self, episodes: int = 100, seed: int = 0, stochastic: bool = False
-    ) -> dict[str, Any]:
+    def evaluate(self, episodes: int = 100, seed: int = 0, stochastic: bool = False) -> Evaluated:
         """Evaluates on whole episodes in fresh environments, as `python -m purerl.evaluate` does.
 
         Args:
@@ -116,7 +164,7 @@ class Run:
 
         from purerl.core.keys import Purpose, derive
         from purerl.experiment.options import check_seed
-        from purerl.ppo.evaluation import evaluate
+        from purerl.ppo.evaluation import evaluate_policy
 
         check_seed(seed)
         if not isinstance(episodes, Integral):
@@ -126,18 +174,20 @@ class Run:
         config, env, network, engine = self.restored.setup
 
         def judge(state: Any, key: Any) -> dict[str, Any]:
-            return evaluate(config, env, network, state, key, episodes, not stochastic)
+            return evaluate_policy(config, env, network, state, key, episodes, not stochastic)
 
-        def summarize(values: Any) -> dict[str, Any]:
-            values = np.asarray(values, float)
-            numbers = {f: float(getattr(values, f)()) for f in ("mean", "std", "min", "max")}
-            return numbers | {"values": values.tolist()}
+        def summarize(values: Any) -> Figures:
+            x = np.asarray(values, float)
+            mean, std, least, most = map(float, (x.mean(), x.std(), x.min(), x.max()))
+            return {"mean": mean, "std": std, "min": least, "max": most, "values": x.tolist()}
 
         key = derive(jax.random.key(seed), Purpose.EVALUATION)
         found = jax.device_get(jax.jit(judge)(self.state, key))
         return {
             "run": str(self.folder),
-            **{name: getattr(self, name) for name in ("update", "steps", "digest")},
+            "update": self.update,
+            "steps": self.steps,
+            "digest": self.digest,
             "engine": engine,
             "seed": seed,
             "policy": "stochastic" if stochastic else "deterministic",

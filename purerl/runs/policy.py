@@ -60,7 +60,7 @@ class Policy:
             lambda x: np.asarray(x).reshape(*self._batch, *x.shape[1:]), self._memory
         )
 
-    def __call__(self, observation: Any, key: Array | None = None) -> np.ndarray:
+    def __call__(self, observation: PyTree, key: Array | None = None) -> np.ndarray:
         """Chooses an action, and moves the memory on.
 
         Args:

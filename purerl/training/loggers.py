@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import purerl
 from purerl.core.errors import UserError, one_line
 from purerl.experiment.options import RunOptions
 from purerl.machine.output import Say
@@ -107,10 +108,8 @@ def check_loggers(options: RunOptions) -> None:
     asked = {"tensorboardX": options.tensorboard, "wandb": options.wandb != "off"}
     for package, wanted in asked.items():
         if wanted and importlib.util.find_spec(package) is None:
-            raise UserError(
-                f"The package {package} is not installed; "
-                f"run: pip install 'purerl[{package.removesuffix('X')}]'"
-            )
+            line = purerl.how_to_install(package.removesuffix("X"))
+            raise UserError(f"The package {package} is not installed; run: {line}")
 
 
 def open_loggers(

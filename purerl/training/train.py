@@ -9,7 +9,7 @@ import platform
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack, overload
 
 from purerl.core.errors import UserError
 from purerl.devices import threads
@@ -17,12 +17,30 @@ from purerl.exact import xla_flags
 from purerl.experiment.command_line import from_settings
 from purerl.experiment.definition import Experiment
 from purerl.experiment.loading import Source, find_source
-from purerl.experiment.options import RunOptions, check_seed
+from purerl.experiment.options import RunOptions, TrainOptions, check_seed
 from purerl.experiment.trust import remember
 from purerl.machine import output
 from purerl.machine.files import check_name
 from purerl.machine.signals import stop_signals
 from purerl.runs.loaded_run import Run
+
+
+@overload
+def train(
+    experiment: str | Path,
+    settings: Mapping[str, Any] | None = None,
+    **options: Unpack[TrainOptions],
+) -> Run: ...
+
+
+@overload
+def train(
+    experiment: str | Path,
+    settings: Mapping[str, Any] | None = None,
+    *,
+    num_seeds: int,
+    **options: Unpack[TrainOptions],
+) -> list[Run]: ...
 
 
 def train(
@@ -39,7 +57,7 @@ def train(
       options: the run command's options: name, resume, num_seeds, runs, checkpoints, ...
 
     Returns:
-      The run, or with `num_seeds` above 1 a list of them.
+      The run; where `num_seeds` is given, a list of them, also of one.
 
     Raises:
       UserError: a name, a value or a file is wrong; the message says how to mend it.
@@ -63,7 +81,7 @@ def train(
     if how.video:
         raise UserError("video is an option of the command; call `python -m purerl.render RUN`.")
     runs = [Run(folder, trust=True) for folder in train_runs(source, chosen, how, _interrupt)]
-    return runs[0] if how.num_seeds == 1 else runs
+    return runs if "num_seeds" in options else runs[0]
 
 
 def train_runs(

@@ -180,7 +180,7 @@ def test_playground_is_stepped_as_by_itself():
 
 @pytest.mark.parametrize("name", ["from_brax", "from_playground", "gymnasium_env"])
 def test_a_library_that_is_not_there_is_one_line(name, monkeypatch):
-    home = f"purerl.adapters.{adapters.HOMES[name]}"
+    home = adapters.HOMES[name]
 
     def missing(module):
         assert module == home

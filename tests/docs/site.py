@@ -56,8 +56,7 @@ def in_site(link: str, here: str) -> str:
 
 def docstring(name: str) -> str:
     """Returns mkdocstrings' block for a public name."""
-    home = purerl.HOMES[name]
-    lines = [f"::: {home}" if home.endswith(f".{name}") else f"::: {home}.{name}", "    options:"]
+    lines = [f"::: {purerl.HOMES[name]}.{name}", "    options:"]
     lines += [f"      heading: {'purerl.' + name}"]
     if name in MEMBERS:
         lines += [f"      members: [{', '.join(MEMBERS[name].split())}]"]

@@ -349,7 +349,7 @@ def test_wrong_names_and_shapes_are_explained():
 
 def test_an_engine_that_is_not_installed_is_told_how_to_be(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ValueError, match=r"warp-lang package \(pip install .*'\.\[warp\]'"):
+    with pytest.raises(ValueError, match=r"needs .* \(python -m pip install .*'\.\[warp\]'"):
         choose_engine("warp")
 
 

@@ -411,7 +411,7 @@ def test_a_memory_may_hold_integers():
     state = INIT(CONFIG, Walk(), counting, jax.random.key(0))
     state, metrics = UPDATE(CONFIG, Walk(), counting, state)
     assert state.carry["count"].dtype == jnp.int32 and metrics["skipped_minibatches"] == 0
-    evaluation.evaluate(CONFIG, Walk(), counting, state, jax.random.key(1), 2)
+    evaluation.evaluate_policy(CONFIG, Walk(), counting, state, jax.random.key(1), 2)
 
 
 def test_a_non_finite_minibatch_is_skipped_and_counted():

@@ -116,6 +116,12 @@ def test_several_seeds_are_several_runs(trained, tmp_path):
     assert first.digest == trained.digest != second.digest
 
 
+def test_who_gives_num_seeds_gets_a_list(tmp_path, monkeypatch):
+    monkeypatch.setattr(train, "train_runs", lambda *_: [tmp_path])
+    assert purerl.train(str(TOY)).folder == tmp_path
+    assert [run_.folder for run_ in purerl.train(str(TOY), num_seeds=1)] == [tmp_path]
+
+
 def test_it_trains_in_a_thread(trained, tmp_path):
     found = []
 
@@ -251,7 +257,7 @@ def test_a_run_from_before_the_move_is_one_line(trained, tmp_path, capsys):
     (old / "experiment.py").write_text(older)
     line = older[: older.index("purerl.config")].count("\n") + 1
     message = (
-        f"purerl: {old}/experiment.py, line {line}: purerl.config has moved, or never was: write "
+        f"purerl: {old}/experiment.py, line {line}: No module named 'purerl.config'; write "
         "`from purerl import Config`. The run was made by an older purerl: train it anew.\n"
     )
     for command in (evaluate, render, record):

@@ -137,7 +137,7 @@ def episodes(
         step = functools.partial(advance, settings, env, others, keep, make_guide(learned), key)
         return jax.lax.scan(lambda now, _: step(now), playing, length=CHUNK)
 
-    # As `evaluation.evaluate` does: the same beginnings.
+    # As `evaluation.evaluate_policy` does: the same beginnings.
     reset_key, key = jax.random.split(derive(jax.random.key(seed), Purpose.EVALUATION))
     playing, go_on = jit("plan_start", first)(learned, reset_key), jit("plan", chunk)
     while True:
@@ -148,7 +148,7 @@ def episodes(
 
 
 def results(playing: Playing) -> dict[str, np.ndarray]:
-    """Returns the figures of episodes that are over, name -> [E], as `evaluation.evaluate` does."""
+    """Returns figures of episodes that are over, name -> [E], as `evaluation.evaluate_policy`."""
     progress = playing.progress
     found = rollout.episode_metrics(progress.episode) | {
         "episode_return": progress.episode.episode_return,

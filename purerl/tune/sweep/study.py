@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import purerl
 from purerl.core.errors import UserError
 from purerl.tune.sweep.points import Point
 from purerl.tune.sweep.spaces import Space
@@ -17,7 +18,8 @@ FIRST = 10  # points that Optuna's sampler draws before it looks at scores
 def check_installed(package: str) -> None:
     """Raises UserError, with the line to paste, unless a package of the extra is there."""
     if importlib.util.find_spec(package) is None:
-        raise UserError(f"The package {package} is not installed; run: pip install 'purerl[sweep]'")
+        line = purerl.how_to_install("sweep")
+        raise UserError(f"The package {package} is not installed; run: {line}")
 
 
 def open_study(folder: Path | None) -> Any:

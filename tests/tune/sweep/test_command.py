@@ -4,6 +4,7 @@ import shlex
 
 import pytest
 
+import purerl
 from purerl import run, sweep
 from purerl.core.errors import SUCCESS, USAGE
 from purerl.experiment.command_line import from_command_line
@@ -133,9 +134,9 @@ def test_without_the_package_there_is_a_line_to_paste(package, capsys, monkeypat
     if package == "optuna":
         words = ["--optuna", "3", "--over", "ppo.gamma=0.9..1"]
     assert sweep.main([str(TOY), *words]) == USAGE
-    said = capsys.readouterr().err
-    assert said == f"purerl: The package {package} is not installed; run: pip install " + (
-        "'purerl[sweep]'\n"
+    line = purerl.how_to_install("sweep")
+    assert (
+        capsys.readouterr().err == f"purerl: The package {package} is not installed; run: {line}\n"
     )
 
 

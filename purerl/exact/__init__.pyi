@@ -1,0 +1,15 @@
+# The public names, each once; `__init__.py` reads this list.
+from purerl.exact.order import (
+    ScatterSum as ScatterSum,
+    unordered_in as unordered_in,
+    unordered_sums as unordered_sums,
+)
+from purerl.exact.portable import without_libraries as without_libraries
+from purerl.exact.rewriting import rewrite as rewrite
+from purerl.exact.xla_flags import (
+    equal_passes as equal_passes,
+    how_chosen as how_chosen,
+    is_portable as is_portable,
+    set_portable_flags as set_portable_flags,
+    set_xla_flags as set_xla_flags,
+)
