@@ -1,8 +1,8 @@
 """Pages that are made from the code.
 
-`SETTINGS`, the records' fields and comments, is a file: `python -m tests.docs --write` writes it, and
-a test compares it. `OF_THE_SITE` are long lists, made when the site is built: what `--help` of each
-command says, and the table of mistakes.
+`SETTINGS`, the records' fields and comments, is a file: `python -m tests.docs --write` writes it,
+and a test compares it. `OF_THE_SITE` are long lists, made when the site is built: what `--help` of
+each command says, and the table of mistakes.
 """
 
 import ast

@@ -1,8 +1,8 @@
 """What the site needs beyond the pages of docs/: a hook of mkdocs (`mkdocs.yml`).
 
-CONTRIBUTING.md, CHANGELOG.md and pages made from the code are pages too, and links lead to them from
-the site as they do on GitHub. The log of measurements is no part of it: a link to an entry becomes
-the entry's path. `<!-- docstring: NAME -->` becomes what the docstring of that name says.
+CONTRIBUTING.md, CHANGELOG.md and pages made from the code are pages too, and links lead to them
+from the site as they do on GitHub. The log of measurements is no part of it: a link to an entry
+becomes the entry's path. `<!-- docstring: NAME -->` becomes what the docstring of that name says.
 """
 
 import json
