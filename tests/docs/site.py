@@ -1,8 +1,9 @@
 """What the site needs beyond the pages of docs/: a hook of mkdocs (`mkdocs.yml`).
 
 CONTRIBUTING.md, CHANGELOG.md and pages made from the code are pages too, and links lead to them
-from the site as they do on GitHub. The log of measurements is no part of it: a link to an entry
-becomes the entry's path. `<!-- docstring: NAME -->` becomes what the docstring of that name says.
+from the site as they do on GitHub. Code and the log of measurements are no part of it: a link to a
+file there becomes the file's path. `<!-- docstring: NAME -->` becomes what the docstring of that
+name says.
 """
 
 import json
@@ -22,7 +23,7 @@ from tests.docs import generated  # noqa: E402
 OUTSIDE = ("CONTRIBUTING.md", "CHANGELOG.md")
 FENCED = re.compile(r"(^ *```.*?^ *```$)", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\((?!https?:|#|mailto:)([^)#\s]+)")
-ENTRY = re.compile(r"\[([^\]]+)\]\((?:\.\./)*(lab/[^)#\s]+)[^)]*\)")
+CODE = re.compile(r"\[([^\]]+)\]\((?:\.\./)+((?:lab|envs|experiments|purerl)/[^)#\s]*)[^)]*\)")
 # What a link leads to on GitHub, and on the site.
 MADE = {"tests/mistakes/table.toml": "reference/mistakes.md"}
 DOCSTRING = re.compile(r"^<!-- docstring: (\w+) -->$", re.MULTILINE)
@@ -52,9 +53,14 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     name = page.file.src_uri
     here = name if name in OUTSIDE else f"docs/{name}"
     parts = FENCED.split(markdown)  # text, block, text, ...
-    texts = (ENTRY.sub(r"\1 (`\2`)", text) for text in parts[::2])
+    texts = (CODE.sub(lambda m: path_of(m[1], m[2]), text) for text in parts[::2])
     parts[::2] = [LINK.sub(lambda m: f"]({in_site(m[1], here)}", text) for text in texts]
     return DOCSTRING.sub(lambda m: docstring(m[1]), "".join(parts))
+
+
+def path_of(text: str, path: str) -> str:
+    """Returns a link's text with the path of a file that the site does not have."""
+    return text if text == f"`{path}`" else f"{text} (`{path}`)"
 
 
 def in_site(link: str, here: str) -> str:
