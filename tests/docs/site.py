@@ -23,7 +23,7 @@ from tests.docs import generated  # noqa: E402
 OUTSIDE = ("CONTRIBUTING.md", "CHANGELOG.md")
 FENCED = re.compile(r"(^ *```.*?^ *```$)", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\((?!https?:|#|mailto:)([^)#\s]+)")
-CODE = re.compile(r"\[([^\]]+)\]\((?:\.\./)+((?:lab|envs|experiments|purerl)/[^)#\s]*)[^)]*\)")
+CODE = re.compile(r"\[([^\]]+)\]\((?:\.\./)*((?:lab|envs|experiments|purerl)/[^)#\s]*)[^)]*\)")
 # What a link leads to on GitHub, and on the site.
 MADE = {"tests/mistakes/table.toml": "reference/mistakes.md"}
 DOCSTRING = re.compile(r"^<!-- docstring: (\w+) -->$", re.MULTILINE)

@@ -109,6 +109,19 @@ def test_links_lead_to_the_same_page_on_github_and_in_the_site(link, here, there
     assert site.in_site(link, here) == there
 
 
+@pytest.mark.parametrize(
+    ("link", "shown"),
+    [
+        ("[the log](../../lab/README.md#words)", "the log (`lab/README.md`)"),
+        ("[lab](lab/README.md)", "lab (`lab/README.md`)"),
+        ("[`envs/run.py`](../envs/run.py)", "`envs/run.py`"),
+        ("[results](../explanation/results.md)", "[results](../explanation/results.md)"),
+    ],
+)
+def test_a_link_to_what_the_site_has_not_becomes_its_path(link, shown):
+    assert site.CODE.sub(lambda m: site.path_of(m[1], m[2]), link) == shown
+
+
 def test_a_notebook_keeps_what_it_prints_and_draws(monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "agg")
     draw = "import matplotlib.pyplot as plt\nplt.plot([1, 2]);"
