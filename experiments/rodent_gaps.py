@@ -11,7 +11,7 @@ Expected: a bounding gallop over every gap. After 28 M steps these ten seeds cro
 comes while the learning rate falls. A policy of `rodent_run`, which does not see the gaps, crosses
 1.1; standing still, none.
 
-`docs/measurements/gpu.md` has their curves, and other rewards and settings.
+`lab/2026-11-26-rodents-with-warp.md` has their curves, and other rewards and settings.
 """
 
 from purerl import Config, Evaluation, Experiment, networks

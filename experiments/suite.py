@@ -2,7 +2,7 @@
 
 python -m purerl.run suite --env.task cheetah-run --name cheetah-run
 
-Expected: return 908 of 1000 after 10 min, on one CPU core; others: docs/measurements/suite.md.
+Expected: return 908 of 1000 after 10 min, on one CPU core; others: lab/2026-11-28-control-suite.md.
 The settings are the defaults: `purerl/ppo/config.py` and `networks.py` say why. Humanoids learn
 nothing with these: `suite_humanoid` has settings for them. A GPU: `suite_gpu`.
 """

@@ -5,7 +5,7 @@ python -m purerl.run suite_gpu --env.task walker-run --engine warp --num-seeds 5
 Expected, of 1000, with five seeds on an H200 beside others: hopper-hop 561 in 6 min; after 30 M
 steps, walker-walk 983 in 8 min. After 100 M, with a discount of their own, walker-run has 884 and
 acrobot-swingup 426, and the sparse acrobot 148, with whole episodes too. Others, and how each was
-trained: docs/measurements/suite.md. Humanoids: `suite_humanoid`.
+trained: lab/2026-11-28-control-suite.md. Humanoids: `suite_humanoid`.
 """
 
 import dataclasses

@@ -1,6 +1,6 @@
 """How cost grows: steps/s and memory over environments, rollout length, width, cores and seeds.
 
-    python -m purerl.experiments.benchmarks.scaling --csv docs/measurements/scaling.csv
+    python -m purerl.experiments.benchmarks.scaling --csv lab/data/scaling.csv
     python -m purerl.experiments.benchmarks.scaling --engine jax --minibatch 4096   # on a GPU
 
 One axis varies, the rest stays as the experiment and its overrides have it; a minibatch holds at

@@ -3,5 +3,5 @@
 They need the `peers` extra, and import the rooms of `purerl` and not only its front door.
 `brax_ant` and `gymnasium_ant` are experiments:
 `python -m purerl.run experiments/peers/gymnasium_ant.py`. What was measured:
-`docs/measurements/peers.md`.
+`lab/README.md`.
 """

@@ -3,7 +3,7 @@
 python -m purerl.run experiments/peers/brax_ant.py
 
 Expected: return 3,300 after 10 M steps (interquartile mean of 8 seeds; brax's own trainer, with its
-published settings: 3,250 after 31 M). `docs/measurements/peers.md` has each seed.
+published settings: 3,250 after 31 M). `lab/2026-11-24-brax-ant.md` has each seed.
 """
 
 from purerl import Config, Evaluation, Experiment, networks

@@ -2,7 +2,7 @@
 
 python -m purerl.run experiments/peers/playground_peer.py --num-seeds 3 --seed 0
 
-Expected: return 850 of 1000 after 2 M steps; beside Playground's own: docs/measurements/peers.md.
+Expected: return 850 of 1000 after 2 M steps; beside Playground's own: lab/2026-11-24-playground.md.
 """
 
 from purerl import Config, Evaluation, Experiment, adapters, networks

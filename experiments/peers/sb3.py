@@ -1,7 +1,7 @@
 """Other trainers beside this one, on the same body: steps per second of whole training.
 
     python -m pip install -c constraints.txt -e '.[peers]'
-    python -m purerl.experiments.peers.sb3 --json docs/measurements/peers_sb3.json
+    python -m purerl.experiments.peers.sb3 --json lab/data/peers_sb3.json
 
 Both train Gymnasium's Ant-v5 on the CPU: stable-baselines3's PPO steps Gymnasium's environment,
 purerl `envs/gymnasium_ant.py`, which a test compares with it. Three settings:

@@ -3,7 +3,7 @@
 MJX factorises a matrix [nv, nv] for each environment and solves with it, several times in a physics
 step. JAX calls cuSOLVER and cuBLAS for that. Each call makes four launches, outside of CUDA graphs;
 of an ant's physics step of 0.50 ms they took 0.19. In these kernels, written in Pallas, each warp
-takes one matrix and keeps it in registers (measured: `docs/measurements/gpu.md`).
+takes one matrix and keeps it in registers (measured: `lab/2026-11-22-fewer-kernels.md`).
 
 Of a matrix [n, n] a warp works on [m, m], where m is the least power of 2 that is not below n, and
 at least 4. Beyond n it reads an identity.

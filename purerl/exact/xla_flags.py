@@ -9,7 +9,7 @@ may choose differently, and another kernel adds in another order. Without timing
   faster by 9%, that of ants over gaps by 12%; nothing else is slower).
 
 XLA is also told to run small kernels side by side in a CUDA graph if they do not depend on each
-other. That changes no bit (`docs/measurements/gpu.md`).
+other. That changes no bit (`lab/2026-11-22-kernels.md`).
 """
 
 import os

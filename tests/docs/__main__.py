@@ -1,6 +1,6 @@
 """Prints which blocks of the pages are executed.
 
-`python -m tests.docs PAGE...` executes pages; `--write` writes those that are made from the code.
+`python -m tests.docs PAGE...` executes pages; `--write` writes docs/reference/settings.md.
 """
 
 import sys
@@ -14,8 +14,7 @@ from tests.docs.play import run
 
 def main() -> None:
     if sys.argv[1:] == ["--write"]:
-        for path, page in generated.PAGES.items():
-            path.write_text(page())
+        generated.SETTINGS.write_text(generated.settings())
         return
     if sys.argv[1:]:
         sys.exit(max(_executed(Path(name)) for name in sys.argv[1:]))

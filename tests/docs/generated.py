@@ -1,7 +1,8 @@
-"""Pages that are written from the code: `python -m tests.docs --write`; a test compares them.
+"""Pages that are made from the code.
 
-The settings are those of the records, with their comments; the commands' options are what `--help`
-says.
+`SETTINGS`, the records' fields and comments, is a file: `python -m tests.docs --write` writes it,
+and a test compares it. `OF_THE_SITE` are long lists, made when the site is built: what `--help` of
+each command says, and the table of mistakes.
 """
 
 import ast
@@ -17,9 +18,9 @@ from purerl.__main__ import COMMANDS, module_of
 from purerl.experiment import options
 from purerl.ppo import config, networks
 from tests.docs.blocks import ROOT
+from tests.mistakes.play import page as mistakes
 
 SETTINGS = ROOT / "docs/reference/settings.md"
-HELP = ROOT / "docs/reference/options.md"
 SETTINGS_HEAD = """# Settings
 
 `python -m tests.docs --write` writes this page from the code. All settings of an experiment, those
@@ -30,8 +31,8 @@ line. What has no default here is the experiment's to say.
 """
 HELP_HEAD = """# Options of the commands
 
-`python -m tests.docs --write` writes this page from the code: it is what `--help` of each command
-says. [Commands](commands.md) is the overview.
+What `--help` of each command says, written when this site was built. [Commands](commands.md) is the
+overview.
 """
 TABLES = {
     "ppo": (config.Config, "The algorithm. [The equations](../explanation/episodes.md) use these."),
@@ -79,7 +80,7 @@ def help_of(command: str, *words: str) -> str:
 
 
 def commands() -> str:
-    """Returns docs/reference/options.md."""
+    """Returns the page of the commands' options."""
     parts = [HELP_HEAD]
     for command in COMMANDS:
         parts.append(f"## {command}\n\n```text\n{help_of(command)}\n```\n")
@@ -89,4 +90,4 @@ def commands() -> str:
     return "\n".join(parts)
 
 
-PAGES = {SETTINGS: settings, HELP: commands}
+OF_THE_SITE = {"reference/options.md": commands, "reference/mistakes.md": mistakes}

@@ -27,6 +27,34 @@ def test_every_block_is_told_how_to_run(name):
             ast.parse(block.code, place)
 
 
+def too_wide(text):
+    """Returns the lines of more than 100 characters that a writer could break, numbered from 1.
+
+    Code, tables and comments are left out, and a line that is one long link.
+    """
+    lines = text.splitlines()
+    code = set()
+    for block in blocks(text):
+        code |= set(range(block.line, block.line + len(block.code.splitlines())))
+    return [
+        number
+        for number, line in enumerate(lines, 1)
+        if len(line) > 100 and number not in code and not re.match(r" *(\||<!--|\S+$)", line)
+    ]
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_is_wrapped_at_100_characters(name):
+    assert not too_wide(PAGES[name].read_text())
+
+
+def test_wide_lines_are_found_but_not_in_tables_and_code():
+    wide = "word " * 25
+    assert too_wide(f"short\n{wide}\n- {wide}\n") == [2, 3]
+    assert not too_wide(f"| {wide} |\n<!-- {wide} -->\n\n```bash\n{wide}\n```\n")
+    assert too_wide(f"```bash\n{wide}\n```\n{wide}\n") == [4]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RUN)
 def test_page_runs(name):

@@ -15,6 +15,7 @@ import purerl
 from purerl.__main__ import COMMANDS
 from tests.docs import generated, notebook, site
 from tests.docs.blocks import ROOT, blocks, pages
+from tests.mistakes.play import read_table
 
 DOCS = ROOT / "docs"
 NOTEBOOKS = sorted(DOCS.rglob("*.ipynb"))
@@ -27,6 +28,8 @@ def test_every_page_is_in_the_navigation_and_the_other_way_round():
     listed = re.findall(r"^ +- (?:[\w ]+: )?([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M)
     there = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")}
     there |= {path.relative_to(DOCS).with_suffix(".md").as_posix() for path in NOTEBOOKS}
+    assert not there & set(generated.OF_THE_SITE), "made when the site is built: no files"
+    there |= set(generated.OF_THE_SITE)
     assert sorted(listed) == sorted(there | set(site.OUTSIDE))
 
 
@@ -76,9 +79,19 @@ def test_settings_are_written_from_the_code():
 
 
 @pytest.mark.slow
-def test_options_are_written_from_the_code():
-    message = "run `python -m tests.docs --write`"
-    assert generated.HELP.read_text() == generated.commands(), message
+def test_the_page_of_options_has_the_help_of_every_command():
+    page = generated.commands()
+    heads = re.findall(r"^## (\w+)\n\n```text\n\S", page, re.MULTILINE)
+    assert heads == list(COMMANDS)
+    assert "--ppo.gamma" in page
+
+
+def test_the_page_of_mistakes_quotes_the_table():
+    page = generated.OF_THE_SITE["reference/mistakes.md"]()
+    quoted = " ".join(line.removeprefix("> ") for line in page.splitlines() if line[:2] == "> ")
+    for mistake in read_table():
+        assert f"**{mistake.title}**" in page
+        assert mistake.says in quoted
 
 
 @pytest.mark.parametrize(
@@ -89,10 +102,24 @@ def test_options_are_written_from_the_code():
         ("docs/howto/a.md", "CHANGELOG.md", "howto/a.md"),
         ("tutorials/n.ipynb", "docs/README.md", "tutorials/n.md"),
         ("rodent.jpg", "docs/README.md", "rodent.jpg"),
+        ("../../tests/mistakes/table.toml", "docs/howto/a.md", "../reference/mistakes.md"),
     ],
 )
 def test_links_lead_to_the_same_page_on_github_and_in_the_site(link, here, there):
     assert site.in_site(link, here) == there
+
+
+@pytest.mark.parametrize(
+    ("link", "shown"),
+    [
+        ("[the log](../../lab/README.md#words)", "the log (`lab/README.md`)"),
+        ("[lab](lab/README.md)", "lab (`lab/README.md`)"),
+        ("[`envs/run.py`](../envs/run.py)", "`envs/run.py`"),
+        ("[results](../explanation/results.md)", "[results](../explanation/results.md)"),
+    ],
+)
+def test_a_link_to_what_the_site_has_not_becomes_its_path(link, shown):
+    assert site.CODE.sub(lambda m: site.path_of(m[1], m[2]), link) == shown
 
 
 def test_a_notebook_keeps_what_it_prints_and_draws(monkeypatch):
@@ -146,4 +173,8 @@ def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_
     text = (tmp_path / "reference/training.html").read_text()
     assert "the path of a Python file, or a dotted module" in text and "docstring:" not in text
     assert (tmp_path / "CONTRIBUTING.html").exists()
+    # Pages that are made from the code, and no link into the log, which is not there.
+    assert "--checkpoints" in (tmp_path / "reference/options.html").read_text()
+    assert "Did you mean" in (tmp_path / "reference/mistakes.html").read_text()
+    assert not [path for path in html if re.search(r'href="[^"]*lab/', path.read_text())]
     assert "data:image/png" in Path(tmp_path, "tutorials/notebook.html").read_text()

@@ -1,10 +1,5 @@
-"""Prints the page of mistakes: `python -m tests.mistakes`; `--write` writes it into docs/."""
+"""Prints the page of mistakes, as the site has it: `python -m tests.mistakes`."""
 
-import sys
+from tests.mistakes.play import page
 
-from tests.mistakes.play import ROOT, page
-
-if "--write" in sys.argv[1:]:
-    (ROOT / "docs/reference/mistakes.md").write_text(page())
-else:
-    print(page())
+print(page())

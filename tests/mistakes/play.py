@@ -153,13 +153,12 @@ HEAD = """# Mistakes, and what you read then
 Every mistake below is one that people make, and the line that it brings. A test makes each of them.
 `...` stands for text that differs from machine to machine. Lines with `-` and `+` are in your
 experiment's file: what should stand there, and what does. Commands end with exit code 2, unless
-another is given. This page is written by `python -m tests.mistakes --write`, from the table
-`tests/mistakes/table.toml`.
+another is given. This page is made from the table `tests/mistakes/table.toml`.
 """
 
 
 def page() -> str:
-    """Returns docs/reference/mistakes.md."""
+    """Returns the page of the site: every mistake, and the line that it brings."""
     parts, mistakes = [HEAD], read_table()
     for where in dict.fromkeys(mistake.where for mistake in mistakes):
         parts.append(f"## {where}\n")

@@ -1,4 +1,4 @@
-"""Every mistake of the table is one line, which names the wrong value; the page quotes them all."""
+"""Every mistake of the table is one line, which names the wrong value."""
 
 import importlib.util
 import shutil
@@ -9,7 +9,7 @@ import jax
 import pytest
 
 from purerl.devices import memory
-from tests.mistakes.play import ROOT, Mistake, agree, make, page, prepare, read_table
+from tests.mistakes.play import Mistake, agree, make, prepare, read_table
 
 TABLE = read_table()
 NEED_A_RUN = ("a run", "no onnx", "MUJOCO_GL=glfw", "an unknown run")
@@ -72,8 +72,3 @@ def test_a_mistake_is_one_line(place, trained, monkeypatch, mistake):
 def test_there_are_many_and_no_two_alike():
     assert len(TABLE) >= 60
     assert len({(mistake.where, mistake.title) for mistake in TABLE}) == len(TABLE)
-
-
-def test_the_page_quotes_the_table():
-    written = (ROOT / "docs/reference/mistakes.md").read_text()
-    assert written == page(), "python -m tests.mistakes --write"

@@ -4,7 +4,8 @@ A batch is one mesh, drawn many times, each with a place, a rotation and a size 
 body is a handful of messages a frame, and a corridor whose boxes move and stretch from step to
 step costs no more than one that does not. (mjviser, which draws MuJoCo's models in the same
 browser page, bakes every geom into a mesh when it starts. To show another gap it would make all
-meshes anew: 0.3 s for an ant, 0.9 s for a rodent, against 0.2 ms: docs/howto/view.md.)
+meshes anew: 0.3 s for an ant, 0.9 s for a rodent, against 0.2 ms, as
+lab/2026-11-23-window-beside-mjviser.md has it.)
 """
 
 from typing import Any, NamedTuple
