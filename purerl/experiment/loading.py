@@ -110,10 +110,11 @@ def load(
     Args:
       path: the file.
       name: the experiment's, if that is not the file's.
-      text: what the file holds, where it has been read.
+      text: what the file holds, where it has been read: of a run's copy.
       origin: the file that it is a copy of. That is its `__file__`: what the experiment reads
         stands beside it.
     """
+    of_run = text is not None
     text = read_bytes(path) if text is None else text
     path = path.resolve()
     place = origin or path
@@ -122,14 +123,14 @@ def load(
     module = importlib.util.module_from_spec(spec)  # type: ignore[arg-type]  # it is a .py file
     sys.modules[module_name] = module  # dataclasses and help texts look their module up
     module.__file__ = str(place)
-    with _mistakes(str(path), place):
+    with _mistakes(str(path), place, of_run):
         nodes = list(ast.walk(ast.parse(text, str(path))))
     if any(isinstance(node, ast.ImportFrom) and node.level for node in nodes):
         raise UserError(
             f"{path} imports relatively (from . import ...), and a run keeps a copy of the file "
             "that has to work alone: import by the full name."
         )
-    with _mistakes(str(path), place):
+    with _mistakes(str(path), place, of_run):
         exec(compile(text, str(path), "exec", dont_inherit=True), module.__dict__)
     if not isinstance(found := getattr(module, "experiment", None), Experiment):
         raise UserError(f"{path} defines no `experiment = Experiment(...)` (it is {found!r}).")
@@ -156,10 +157,10 @@ def _module_name(path: Path) -> str:
 
 
 @contextlib.contextmanager
-def _mistakes(file: str, place: Path) -> Iterator[None]:
+def _mistakes(file: str, place: Path, of_run: bool) -> Iterator[None]:
     """Turns an error in a person's own file into one line with the line that they need to see.
 
-    `place` is where the file's modules stand: a run has a copy of it alone.
+    `place` is where the file's modules stand. A file `of_run` is the copy that a run has alone.
     """
     try:
         yield
@@ -169,7 +170,7 @@ def _mistakes(file: str, place: Path) -> Iterator[None]:
         lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == file]
         where = f", line {lines[-1]}" if lines else ""
         hint = _import_hint(error, place) if isinstance(error, ImportError) else ""
-        if "from purerl" in hint and (Path(file).parent / "config.json").exists():
+        if "from purerl" in hint and of_run:
             hint += ". The run was made by an older purerl: train it anew."
         hint = hint or suggest_field(str(error), Config, Evaluation, Experiment)
         said = re.sub(r"('purerl[.\w]*') \(.*\)$", r"\1", one_line(error))

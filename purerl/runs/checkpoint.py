@@ -143,9 +143,15 @@ def newest(
     return []
 
 
-def check_fits(folder: Path, abstract: PyTree) -> None:
-    """Raises UserError if the newest checkpoint is of another state; reads no array."""
-    for update in reversed(checkpoint_folder.updates(folder)):
+def check_fits(folder: Path, updates: Sequence[int], abstract: PyTree) -> None:
+    """Raises UserError if the newest checkpoint is of another state; reads no array.
+
+    Args:
+      folder: the checkpoints.
+      updates: that have one, oldest first.
+      abstract: shapes of the state.
+    """
+    for update in reversed(updates):
         path = path_of(folder, update)
         with contextlib.suppress(DamagedError):
             _check_fits(path, load_meta(path), abstract)

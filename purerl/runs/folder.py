@@ -61,6 +61,12 @@ class Folder(NamedTuple):
         return self.path / METRICS
 
     @property
+    def is_edited(self) -> bool:
+        """Whether one of the three files is not what the run wrote."""
+        written = fingerprint(self.config, self.manifest, self.code)
+        return self.manifest.get("fingerprint") != written
+
+    @property
     def is_begun(self) -> bool:
         """Whether it has, or had, a checkpoint; a run without one has nothing to protect."""
         had = self.manifest.get("had_checkpoint")
@@ -123,14 +129,15 @@ def allowed_changes(folder: Folder) -> list[dict[str, Any]]:
     return check_object(where, known, allowed_changes=list)["allowed_changes"]
 
 
-def write(path: Path, config: dict[str, Any], manifest: dict[str, Any], code: bytes) -> Folder:
+def write(folder: Folder, config: dict[str, Any], manifest: dict[str, Any], code: bytes) -> Folder:
     """Writes the three files that describe a run; config.json last, it makes it a run."""
     manifest = manifest | {"fingerprint": fingerprint(config, manifest, code)}
-    make_folder(path / CHECKPOINTS)
-    write_file(path / CODE, code)
-    write_json(path / MANIFEST, manifest)
-    write_json(path / CONFIG, config)
-    return _list(path)._replace(config=config, manifest=manifest, code=code)
+    make_folder(folder.checkpoints)
+    write_file(folder.path / CODE, code)
+    write_json(folder.path / MANIFEST, manifest)
+    write_json(folder.path / CONFIG, config)
+    names = folder.names | {CONFIG, MANIFEST, CODE, CHECKPOINTS}
+    return folder._replace(names=names, config=config, manifest=manifest, code=code)
 
 
 def note(folder: Folder, **facts: Any) -> Folder:

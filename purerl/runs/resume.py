@@ -17,7 +17,6 @@ from purerl.machine.files import draft_of
 from purerl.ppo.config import Config
 from purerl.runs import manifest
 from purerl.runs.folder import CODE, CONFIG, OURS, Folder, check_manifest
-from purerl.runs.identity import fingerprint
 
 EDITED = "fingerprint: config.json, manifest.json or experiment.py is not what the run wrote"
 MANY = 9  # edited files, which a refusal to resume then counts and does not list
@@ -136,8 +135,7 @@ def changes(folder: Folder, now: Description) -> list[str]:
 
 def edited(folder: Folder) -> list[str]:
     """Returns a line if the three files that describe a run are not what it wrote."""
-    written = fingerprint(folder.config, folder.manifest, folder.code)
-    return [] if folder.manifest.get("fingerprint") == written else [EDITED]
+    return [EDITED] if folder.is_edited else []
 
 
 def _check_trains_what_is_new(folder: Folder, config: dict[str, Any], found: list[str]) -> None:

@@ -179,5 +179,5 @@ def _write_down(
     facts = what_to_write(folder, now, job.options.allow_changes, begun)
     if facts is None:
         return folder
-    checkpoint.check_fits(folder.checkpoints, job.abstract)
-    return run_folder.write(folder.path, now.config, facts, source.text)
+    checkpoint.check_fits(folder.checkpoints, folder.updates, job.abstract)
+    return run_folder.write(folder, now.config, facts, source.text)

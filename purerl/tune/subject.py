@@ -15,6 +15,7 @@ from purerl.experiment.loading import Source
 from purerl.experiment.options import check_seed
 from purerl.machine import output
 from purerl.machine.command_errors import tell
+from purerl.runs.folder import CODE
 from purerl.runs.loaded_run import Run, load
 from purerl.tune.plan.settings import Settings
 
@@ -99,7 +100,7 @@ def find(words: Sequence[str], prog: str) -> Subject:
     except argparse.ArgumentError as error:
         raise UserError(f"The command line is wrong: {error}.") from error
     run = load(name, known.checkpoint, known.engine, known.trust)
-    return Subject(name, Source(run.experiment, name, Path(name) / "experiment.py"), run)
+    return Subject(name, Source(run.experiment, name, Path(name) / CODE), run)
 
 
 def chosen(
