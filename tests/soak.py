@@ -28,13 +28,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import SUCCESS
-from tests.checks.io_faults import ERRORS, LASTING, saved_by
-from tests.checks.kills import spawn
-from tests.checks.power_cuts import cuts_after
 from tests.faults import disk, verdicts
 from tests.faults.commands import Answer, Worker, fresh, workplace
 from tests.faults.shim import Fault
 from tests.faults.verdicts import NAME, STOP_AT, TOY, Whole, command, go_on
+from tests.long.io_faults import ERRORS, LASTING, saved_by
+from tests.long.kills import spawn
+from tests.long.power_cuts import cuts_after
 
 GO_ON = 0.6  # the chance that a life is followed by another one that is disturbed
 STARTING = 0.25  # share of the kills that come while a process is starting

@@ -6,9 +6,9 @@ import pytest
 
 from purerl.experiment import objects
 from purerl.ppo import algorithm
-from tests.checks import platforms
+from tests.long import platforms
 from tests.runs import toy_experiment
-from tests.runs.test_run import TOY
+from tests.training.test_run import TOY
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ from purerl.experiment import objects
 from purerl.ppo.config import Evaluation
 from purerl.runs import checkpoint_folder
 from tests.runs import toy_experiment
-from tests.runs.test_run import ROOT, TOY
+from tests.training.test_run import ROOT, TOY
 
 CARTPOLE = [str(ROOT / "experiments" / "cartpole_swingup.py"), "--ppo.num-envs", "16"]
 CARTPOLE += ["--ppo.rollout-length", "8", "--ppo.num-steps", "512", "--ppo.num-minibatches", "2"]
@@ -138,7 +138,7 @@ def test_the_check_of_a_persons_own_devices():
     """Its short form, on two virtual ones."""
     words = ["2", "--", str(TOY), *TRAINING]
     said = subprocess.run(
-        [sys.executable, "-m", "tests.checks.shards", *words],
+        [sys.executable, "-m", "tests.long.shards", *words],
         cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True, timeout=200,
     ).stdout  # fmt: skip
     (one, *_, first), (two, *_, second) = (line.split() for line in said.splitlines()[1:])

@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-from tests.checks.io_faults import ERRORS, SITUATIONS, cases_of, choose
 from tests.faults import shim
 from tests.faults.commands import Answer
 from tests.faults.verdicts import Whole, began_at, complaint, kind_of, saved, untold
+from tests.long.io_faults import ERRORS, SITUATIONS, cases_of, choose
 
 LINES = [{"update": 1, "x": 0.5}, {"update": 2, "x": 0.25, "digest": "d"}]
 WHOLE = Whole([], [LINES])

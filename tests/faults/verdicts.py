@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
-from tests.checks.kills import find, read_lines
 from tests.faults.commands import Answer, Worker
+from tests.long.kills import find, read_lines
 
 NAME = "run"
 TOY = Path(__file__).parent.parent / "runs" / "toy_experiment.py"

@@ -16,7 +16,7 @@ from purerl.ppo import running_moments
 from purerl.ppo.networks import GaussianHead, PolicyOptions
 from purerl.report import episode_arrays
 from purerl.runs import restored_run
-from tests.runs.test_run import TOY
+from tests.training.test_run import TOY
 
 TRAIN = """
 import dataclasses

@@ -18,7 +18,7 @@ from purerl.core.errors import FAILURE, SUCCESS, RunError, UserError
 from purerl.machine import array_files, files, state_arrays
 from purerl.machine.lock import FolderLock
 from purerl.runs import checkpoint, checkpoint_folder
-from tests.runs.test_run import (
+from tests.training.test_run import (
     checkpoints,
     digest,
     folder,

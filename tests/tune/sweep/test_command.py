@@ -9,7 +9,7 @@ from purerl import run, sweep
 from purerl.core.errors import SUCCESS, USAGE
 from purerl.experiment.command_line import from_command_line
 from purerl.experiment.loading import find_source
-from tests.runs.test_run import TOY
+from tests.training.test_run import TOY
 
 FILE = f"""
 experiment = "{TOY}"

@@ -13,7 +13,7 @@ import pytest
 from purerl.machine.lock import FolderLock
 from purerl.tune.sweep import scheduler
 from purerl.tune.sweep.scheduler import Job, environment_of, find_gpus, jobs_at_once
-from tests.runs.test_run import ROOT
+from tests.training.test_run import ROOT
 
 
 def job(name: str, *words: str, seeds: int = 2) -> Job:

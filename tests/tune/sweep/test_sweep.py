@@ -17,8 +17,8 @@ from PIL import Image
 from purerl import sweep
 from purerl.core.errors import FAILURE, SUCCESS, USAGE
 from purerl.tune.sweep import scheduler, slurm
-from tests.checks.kills import read_lines
-from tests.runs.test_run import ROOT, TOY
+from tests.long.kills import read_lines
+from tests.training.test_run import ROOT, TOY
 
 RATES = ["--grid", "ppo.learning-rate=1e-2,2e-3,9e-4"]
 

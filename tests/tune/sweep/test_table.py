@@ -10,7 +10,7 @@ from purerl.tune.sweep import picture, table
 from purerl.tune.sweep.points import Base, Point
 from purerl.tune.sweep.spaces import parse_space
 from purerl.tune.sweep.table import Row, by_value
-from tests.runs.test_run import TOY
+from tests.training.test_run import TOY
 
 
 def row(number: int, score, status: str = "done", **values) -> Row:

@@ -13,7 +13,7 @@ from purerl.devices import programs
 from purerl.machine import state_arrays
 from purerl.runs import checkpoint, checkpoint_folder
 from purerl.training import console, loop, seeds, train, writer
-from tests.runs.test_run import ROOT, TOY, Stopper, digest, folder, lines, start
+from tests.training.test_run import ROOT, TOY, Stopper, digest, folder, lines, start
 
 CARTPOLE = ["--ppo.num-envs", "4", "--ppo.rollout-length", "8", "--ppo.num-steps", "128"]
 CARTPOLE += ["--ppo.num-minibatches", "2", "--evaluation.number", "1"]

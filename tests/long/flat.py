@@ -1,6 +1,6 @@
 """Watches memory, file descriptors and threads of a long run with many checkpoints: they are flat.
 
-python -m tests.checks.flat [--updates 20000] [--checkpoints 500]
+python -m tests.long.flat [--updates 20000] [--checkpoints 500]
 
 Trains the tests' tiny experiment in a process of its own, and reads /proc four times a second.
 Prints the largest values in each quarter of the updates. Exit code 0 if the last quarter has no
@@ -36,9 +36,7 @@ class Sample(NamedTuple):
 def main() -> int:
     """Runs the check; returns its exit code."""
     plain = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
-        "tests.checks.flat", description=__doc__, formatter_class=plain
-    )
+    parser = argparse.ArgumentParser("tests.long.flat", description=__doc__, formatter_class=plain)
     parser.add_argument("--updates", type=int, default=20_000)
     parser.add_argument("--checkpoints", type=int, default=500)
     given = parser.parse_args()

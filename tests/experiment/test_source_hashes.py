@@ -24,7 +24,7 @@ from tests.ppo.probes import Probe
 from tests.test_rooms import MODULES, own
 
 ROOT = Path(__file__).parent.parent.parent
-TOY = Path(__file__).parent / "toy_experiment.py"
+TOY = Path(__file__).parent.parent / "runs" / "toy_experiment.py"
 COMPUTING = ["adapters", "core", "devices", "exact", "physics", "ppo"]  # rooms
 AN_EDIT = "\nEDITED = True\n"
 # What moves no bit.
@@ -220,7 +220,7 @@ def test_the_manifest_of_a_run_holds_every_room_that_computes(tmp_path):
 def test_only_what_the_builders_import_is_followed():
     found = source_hashes.imported_files(["tests.runs.toy_experiment"])
     assert {"tests.runs.toy_experiment", "tests.ppo.probes", "tests"} <= set(found)
-    assert not {"tests.runs.test_run", "jax"} & set(found)
+    assert not {"tests.training.test_run", "jax"} & set(found)
     assert not any(name.startswith("purerl") for name in found)  # those count whole
 
 

@@ -1,7 +1,7 @@
 """Has this machine the portable bits? Two machines' answers are compared by `diff`.
 
-python -m tests.checks.portable > here.txt             # operations, and all golden runs
-python -m tests.checks.portable cartpole ant_c > here.txt
+python -m tests.long.portable > here.txt             # operations, and all golden runs
+python -m tests.long.portable cartpole ant_c > here.txt
 
 One fact a line. Lines of `machine` may differ. If no line of `version` or `library` does, none of
 `operation` (which finds where bits part) and of `run` (a digest of each golden run) may.

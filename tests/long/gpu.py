@@ -1,6 +1,6 @@
 """Is a run the same in two processes on this device, and what do the measures for it cost?
 
-python -m tests.checks.gpu -- ant_run --ppo.num-envs 4096 --ppo.num-steps 20000000
+python -m tests.long.gpu -- ant_run --ppo.num-envs 4096 --ppo.num-steps 20000000
 
 What follows `--` is a command line of `python -m purerl.run` without --name, --runs and --resume.
 Each variant is run in two processes, one after the other, each with an empty compilation cache. A
@@ -58,7 +58,7 @@ class Result(NamedTuple):
 def main() -> int:
     """Runs the check; exit code 0 if all runs that shall be the same were."""
     plain = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("tests.checks.gpu", description=__doc__, formatter_class=plain)
+    parser = argparse.ArgumentParser("tests.long.gpu", description=__doc__, formatter_class=plain)
     parser.add_argument("--only", nargs="*", default=list(FLAGS), choices=list(FLAGS))
     parser.add_argument("words", nargs="+", help="-- EXPERIMENT [--option value ...]")
     options = parser.parse_args()

@@ -1,6 +1,6 @@
 """Does this machine's GPU compute what a CPU computes?
 
-python -m tests.checks.platforms ant_run --engine jax --ppo.num-envs 256 --ppo.rollout-length 16
+python -m tests.long.platforms ant_run --engine jax --ppo.num-envs 256 --ppo.rollout-length 16
 
 One process computes on a CPU: a beginning, a rollout, a control step under random actions from
 where that ended, and what is learned of it. Another does the step and the learning on JAX's default
@@ -36,7 +36,7 @@ def main(arguments: list[str]) -> int:
     """Runs the check; returns its exit code."""
     plain = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
-        "tests.checks.platforms", description=__doc__, formatter_class=plain
+        "tests.long.platforms", description=__doc__, formatter_class=plain
     )
     parser.add_argument("experiment", help="as for python -m purerl.run, with its overrides")
     parser.add_argument("--limit", type=float, default=1e-3, help="of relative differences")
@@ -45,7 +45,7 @@ def main(arguments: list[str]) -> int:
     exact.set_xla_flags()
     precision = os.environ.get("JAX_DEFAULT_MATMUL_PRECISION", "highest")
     jax.config.update("jax_default_matmul_precision", precision)
-    prog = f"python -m tests.checks.platforms {options.experiment}"
+    prog = f"python -m tests.long.platforms {options.experiment}"
     experiment, _ = command_line.from_command_line(find_source(options.experiment), overrides, prog)
     setup = objects.build(experiment)
     if options.write:
@@ -69,7 +69,7 @@ def ask_cpu(words: list[str]) -> None:
     # On two of XLA's threads, MJX's factorisations can wait for each other for ever.
     threads = os.environ.get("NPROC", "1")
     subprocess.run(
-        [sys.executable, "-m", "tests.checks.platforms", *words],
+        [sys.executable, "-m", "tests.long.platforms", *words],
         env=os.environ | {"JAX_PLATFORMS": "cpu", "NPROC": threads}, check=True,
     )  # fmt: skip
 

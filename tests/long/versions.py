@@ -1,6 +1,6 @@
 """Does a run go on under other versions of Python and JAX, and does it say that bits may change?
 
-python -m tests.checks.versions /path/to/another/python ...
+python -m tests.long.versions /path/to/another/python ...
 
 This interpreter and each of the others begin a run of their own and stop half-way. Every other one
 of them is then asked to go on: it has to refuse and name the versions; with --allow-changes, to
@@ -37,7 +37,7 @@ def main(arguments: list[str]) -> int:
     """Runs the check; returns its exit code."""
     plain = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
-        "tests.checks.versions", description=__doc__, formatter_class=plain
+        "tests.long.versions", description=__doc__, formatter_class=plain
     )
     parser.add_argument("pythons", nargs="+", help="other interpreters that can import purerl")
     pythons = [sys.executable, *parser.parse_args(arguments).pythons]

@@ -20,7 +20,7 @@ from purerl.experiment.objects import build
 from purerl.physics.interface import Physics
 from purerl.ppo.config import Config
 from purerl.ppo.networks import MlpOptions, RecurrentOptions, from_linen, mlp, recurrent
-from tests.runs.test_check_env import Toy, toy_state
+from tests.checks.test_check_env import Toy, toy_state
 from tests.runs.toy_experiment import experiment
 
 pytestmark = pytest.mark.slow

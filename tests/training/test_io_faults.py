@@ -1,10 +1,10 @@
-"""Some faults of the disk; `python -m tests.checks.io_faults` makes every call of a run fail."""
+"""Some faults of the disk; `python -m tests.long.io_faults` makes every call of a run fail."""
 
 import pytest
 
-from tests.checks.io_faults import SITUATIONS, fault_all
 from tests.faults import shim
 from tests.faults.verdicts import SHORT
+from tests.long.io_faults import SITUATIONS, fault_all
 
 
 @pytest.mark.slow

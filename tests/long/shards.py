@@ -1,7 +1,7 @@
 """Is a run the same on any number of devices, and how fast is it on each?
 
-python -m tests.checks.shards 2 -- ant_run --engine jax --ppo.num-envs 8192 --ppo.num-steps 12000000
-python -m tests.checks.shards 4 -- cartpole_swingup --ppo.num-steps 100000
+python -m tests.long.shards 2 -- ant_run --engine jax --ppo.num-envs 8192 --ppo.num-steps 12000000
+python -m tests.long.shards 4 -- cartpole_swingup --ppo.num-steps 100000
 
 The first word is the number of shards; what follows `--` is a command line of `purerl.run` without
 --num-shards, --name, --runs and --resume. The run is made once on each number of devices that
@@ -20,7 +20,7 @@ from typing import Any
 
 from purerl.report import bit_diff
 from purerl.report.run_reader import RunRecord
-from tests.checks.gpu import run_quietly, speed
+from tests.long.gpu import run_quietly, speed
 
 FIND = "import jax; print(jax.default_backend(), jax.device_count())"
 
@@ -29,7 +29,7 @@ def main() -> int:
     """Runs the check; exit code 0 if all runs were the same."""
     plain = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
-        "tests.checks.shards", description=__doc__, formatter_class=plain
+        "tests.long.shards", description=__doc__, formatter_class=plain
     )
     parser.add_argument("shards", type=int, help="number of shards")
     parser.add_argument("words", nargs="+", help="-- EXPERIMENT [--option value ...]")

@@ -18,7 +18,7 @@ from purerl.core.errors import FAILURE, SUCCESS, USAGE, RunError, UserError
 from purerl.machine import command_errors, output
 from purerl.machine.files import write_answer
 from purerl.report import opengl
-from tests.runs.test_run import ROOT, TOY, digest, folder, whole  # noqa: F401
+from tests.training.test_run import ROOT, TOY, digest, folder, whole  # noqa: F401
 
 pytestmark = pytest.mark.slow
 

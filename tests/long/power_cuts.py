@@ -1,6 +1,6 @@
 """Cuts the power after every change that a short run makes to its files, and resumes what is left.
 
-python -m tests.checks.power_cuts [--every 10] [--models strict,names] [-- EXPERIMENT [--option 1]]
+python -m tests.long.power_cuts [--every 10] [--models strict,names] [-- EXPERIMENT [--option 1]]
 
 Records the calls of a run that is stopped in between and resumed (`tests/faults/shim.c`). For a cut
 after each of its changes, `tests/faults/disk.py` tells which files a power cut may leave: only what
@@ -76,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the check; returns its exit code."""
     plain = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
-        "tests.checks.power_cuts", description=__doc__, formatter_class=plain
+        "tests.long.power_cuts", description=__doc__, formatter_class=plain
     )
     parser.add_argument(
         "--every",

@@ -1,4 +1,4 @@
-"""What a checkpoint costs: python -m tests.checks.checkpoint_cost -- ant_run --ppo.num-envs 4096
+"""What a checkpoint costs: python -m tests.long.checkpoint_cost -- ant_run --ppo.num-envs 4096
 
 What follows `--` is a command line of `python -m purerl.run`. Prints bytes and seconds, the median
 of several: `holds up` is what training waits for (the copy to the host), `writes` happens meanwhile
@@ -31,12 +31,12 @@ def main() -> None:
     """Measures and prints."""
     plain = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
-        "tests.checks.checkpoint_cost", description=__doc__, formatter_class=plain
+        "tests.long.checkpoint_cost", description=__doc__, formatter_class=plain
     )
     parser.add_argument("words", nargs="+", help="-- EXPERIMENT [--option value ...]")
     words = parser.parse_args().words
     source = loading.find_source(words[0])
-    chosen, _ = from_command_line(source, words[1:], "tests.checks.checkpoint_cost")
+    chosen, _ = from_command_line(source, words[1:], "tests.long.checkpoint_cost")
     set_up_jax(True)
     setup = objects.build(chosen)
     state = jax.jit(functools.partial(algorithm.init, *setup[:3]))(jax.random.key(1))

@@ -30,7 +30,7 @@ from purerl.ppo.config import Evaluation
 from purerl.runs import checkpoint, checkpoint_folder, folder as run_folder, resume
 from purerl.training import console, train, writer
 
-TOY = Path(__file__).parent / "toy_experiment.py"
+TOY = Path(__file__).parent.parent / "runs" / "toy_experiment.py"
 ROOT = TOY.parent.parent.parent
 LONG = ["--ppo.num-steps", "6400", "--checkpoints", "20"]  # 200 updates: seconds
 

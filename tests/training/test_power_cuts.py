@@ -1,10 +1,10 @@
-"""Some power cuts; `python -m tests.checks.power_cuts` makes one after every change of a file."""
+"""Some power cuts; `python -m tests.long.power_cuts` makes one after every change of a file."""
 
 import pytest
 
-from tests.checks.power_cuts import cut_all
 from tests.faults import shim
 from tests.faults.verdicts import SHORT
+from tests.long.power_cuts import cut_all
 
 
 @pytest.mark.slow

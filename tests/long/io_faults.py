@@ -1,6 +1,6 @@
 """Makes every call that a short run makes to its files fail, one at a time, and sees what it does.
 
-python -m tests.checks.io_faults [--every 5] [--sample 100] [--only start] [-- EXPERIMENT [...]]
+python -m tests.long.io_faults [--every 5] [--sample 100] [--only start] [-- EXPERIMENT [...]]
 
 A run is made three times: from the start, resumed after a stop, and while it is asked to stop.
 Each call below its folder (open, read, write, fsync, rename, mkdir, remove, list, stat, ...) fails
@@ -102,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the check; returns its exit code."""
     plain = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
-        "tests.checks.io_faults", description=__doc__, formatter_class=plain
+        "tests.long.io_faults", description=__doc__, formatter_class=plain
     )
     names = [situation.name for situation in SITUATIONS]
     parser.add_argument("--every", type=int, default=1, help="of so many like faults, one is made")

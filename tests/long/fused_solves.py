@@ -1,6 +1,6 @@
 """Are small linear systems right on this GPU, and how fast beside JAX's own library?
 
-python -m tests.checks.fused_solves
+python -m tests.long.fused_solves
 
 A row is one size: a Cholesky factor of each of so many systems and the two solves with it, in a
 loop of 50. Errors are the greatest of any solution, relative to its greatest entry in float64.

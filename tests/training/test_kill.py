@@ -1,9 +1,9 @@
-"""A few kills at random moments; `python -m tests.checks.kills` makes as many as you like."""
+"""A few kills at random moments; `python -m tests.long.kills` makes as many as you like."""
 
 import pytest
 
-from tests.checks.kills import kill_many
-from tests.runs.test_run import TOY
+from tests.long.kills import kill_many
+from tests.training.test_run import TOY
 
 LONG = [str(TOY), "--ppo.num-steps", "4800", "--checkpoints", "15"]
 

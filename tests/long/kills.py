@@ -1,6 +1,6 @@
 """Kills a run with SIGKILL at random moments, resumes it, and compares with one left in peace.
 
-python -m tests.checks.kills --kills 50 -- cartpole_swingup --ppo.num-steps 60000 --checkpoints 40
+python -m tests.long.kills --kills 50 -- cartpole_swingup --ppo.num-steps 60000 --checkpoints 40
 
 What follows `--` is a command line of `python -m purerl.run` without --name, --runs and --resume.
 Each of the runs is killed once, at a moment drawn from the seed: a quarter of them while starting
@@ -47,9 +47,7 @@ class Killed(NamedTuple):
 def main() -> int:
     """Runs the test; returns its exit code."""
     plain = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
-        "tests.checks.kills", description=__doc__, formatter_class=plain
-    )
+    parser = argparse.ArgumentParser("tests.long.kills", description=__doc__, formatter_class=plain)
     parser.add_argument("--kills", type=int, default=50, help="runs to kill")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     parser.add_argument("words", nargs="+", help="-- EXPERIMENT [--option value ...]")

@@ -1,6 +1,6 @@
 """Is an installed purerl whole, alone and gone when it is uninstalled: wheel, sdist, for editing?
 
-python -m tests.checks.wheel [--quick]
+python -m tests.long.wheel [--quick]
 
 The sdist and the wheel are built from a copy of this clone. In an empty environment each of the
 three ways to install is tried: what it takes of Python's names, the commands in a folder whose
@@ -73,9 +73,7 @@ class Place(NamedTuple):
 def main(arguments: list[str]) -> int:
     """Runs the check; returns its exit code."""
     plain = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
-        "tests.checks.wheel", description=__doc__, formatter_class=plain
-    )
+    parser = argparse.ArgumentParser("tests.long.wheel", description=__doc__, formatter_class=plain)
     parser.add_argument("--quick", action="store_true", help="train briefly")
     quick = parser.parse_args(arguments).quick
     with tempfile.TemporaryDirectory(prefix="purerl-wheel-") as folder:

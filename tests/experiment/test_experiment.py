@@ -10,7 +10,7 @@ from purerl.core.errors import UserError
 from purerl.experiment import loading, settings_json
 from purerl.runs import resume
 
-TOY = Path(__file__).parent / "toy_experiment.py"
+TOY = Path(__file__).parent.parent / "runs" / "toy_experiment.py"
 
 
 @pytest.fixture
