@@ -125,6 +125,16 @@ def test_a_room_says_what_belongs_there(room):
     assert re.search(r"\bRead:? ", said), "where a reader starts"
 
 
+@pytest.mark.parametrize("room", MAY_IMPORT)
+def test_a_room_has_half_a_page_that_names_where_to_start(room):
+    text = (HOUSE / room / "README.md").read_text()
+    assert text.startswith(f"# `{room}`: ") and len(text.splitlines()) <= 40
+    assert all(part in text for part in ("here to start", "refuses"))
+    for name in re.findall(r"`([\w/.]+\.(?:py|md))`", text):
+        places = [HOUSE / room / name, HOUSE / name, ROOT / name]
+        assert name == "experiment.py" or any(map(Path.exists, places)), name  # a run's file
+
+
 def test_contributors_read_the_same_table():
     text = (ROOT / "CONTRIBUTING.md").read_text()
     for room, below in MAY_IMPORT.items():

@@ -13,7 +13,7 @@ import tyro
 
 from purerl.core.errors import SUCCESS, RunError, UserError, nearest
 from purerl.experiment import other_trainers, settings_json
-from purerl.experiment.definition import Experiment
+from purerl.experiment.definition import Experiment, shrunk
 from purerl.experiment.loading import Source, available, summary
 from purerl.experiment.options import RunOptions
 from purerl.machine import output
@@ -63,7 +63,24 @@ def from_command_line(
     Raises:
       UserError: there is no such option, or a value is wrong.
     """
-    values = settings_json.settings_of(source.experiment)
+    chosen, options = _parse_over(source.experiment, source, arguments, prog, config, base, names)
+    if getattr(options, "debug", False):  # tiny sizes, but for those that were given
+        tiny = shrunk(source.experiment)
+        return _parse_over(tiny, source, arguments, prog, config, base, names)
+    return chosen, options
+
+
+def _parse_over(
+    experiment: Experiment,
+    source: Source,
+    arguments: Sequence[str],
+    prog: str,
+    config: Any,
+    base: Any,
+    names: Sequence[str],
+) -> tuple[Experiment, Any]:
+    """Parses a command line over the settings of an experiment; see `from_command_line`."""
+    values = settings_json.settings_of(experiment)
     values = {name: values[name] for name in names or values}
     kinds = {f.name: f.type for f in dataclasses.fields(Experiment)}
     kinds |= {name: type(v) for name, v in values.items() if dataclasses.is_dataclass(v)}
@@ -75,7 +92,7 @@ def from_command_line(
     parsed = parse(both, arguments, prog, both(**values), config)
     overrides = {name: getattr(parsed, name) for name in values}
     options = {f.name: getattr(parsed, f.name) for f in dataclasses.fields(base)}
-    return dataclasses.replace(source.experiment, **overrides), base(**options)
+    return dataclasses.replace(experiment, **overrides), base(**options)
 
 
 def from_settings(

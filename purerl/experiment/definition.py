@@ -4,7 +4,7 @@ Nothing heavy is imported here, so that a list of experiments or a help page com
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
@@ -44,3 +44,15 @@ class Experiment:
 
 
 BUILDERS = ("build_env", "build_network")
+
+
+def shrunk(experiment: Experiment) -> Experiment:
+    """Returns an experiment of tiny sizes, to see within a minute that every part of it runs."""
+    length = min(experiment.ppo.episode_length, 32)
+    ppo = replace(
+        experiment.ppo, num_steps=1024, num_envs=8, rollout_length=32, num_epochs=1,
+        num_minibatches=2, episode_length=length,
+    )  # fmt: skip
+    number = min(experiment.evaluation.number, 1)
+    evaluation = replace(experiment.evaluation, num_episodes=2, number=number)
+    return replace(experiment, ppo=ppo, evaluation=evaluation)

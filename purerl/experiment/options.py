@@ -62,6 +62,9 @@ class RunOptions:
     """Resume although settings, versions or device differ; written down in manifest.json."""
     runs: Path = Path("runs")
     """Folder of all runs."""
+    debug: bool = False
+    """Tiny sizes, where no other is given: every part of the experiment runs within a minute, most
+    of which compiles. Without --runs the run goes into a temporary folder."""
     log_every: int = 0
     """Updates between two lines of metrics.jsonl; 0: chosen for about 500 lines."""
     checkpoints: int = 10
@@ -118,6 +121,7 @@ class TrainOptions(TypedDict, total=False):
     resume: bool
     allow_changes: bool
     runs: str | Path
+    debug: bool
     log_every: int
     checkpoints: int
     keep: int

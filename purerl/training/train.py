@@ -7,6 +7,7 @@ import dataclasses
 import os
 import platform
 import sys
+import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Unpack, overload
@@ -115,13 +116,15 @@ def train_runs(
 
 def _folders(source: Source, chosen: Experiment, options: RunOptions) -> dict[Path, Experiment]:
     """Returns each seed's folder, and the experiment with that seed."""
-    runs = {}
+    runs, place = {}, options.runs
+    if options.debug and place == RunOptions.runs:
+        place = Path(tempfile.mkdtemp(prefix="purerl-debug-"))
     for seed in range(chosen.seed, chosen.seed + options.num_seeds):
         check_seed(seed)
         name = options.name or f"seed{seed}"
         if options.num_seeds > 1 and options.name:
             name += f"-seed{seed}"
-        runs[options.runs / source.name / name] = dataclasses.replace(chosen, seed=seed)
+        runs[place / source.name / name] = dataclasses.replace(chosen, seed=seed)
     return runs
 
 

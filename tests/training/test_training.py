@@ -109,6 +109,20 @@ def test_a_run_that_was_stopped_goes_on(trained, tmp_path, monkeypatch):
     assert run_.digest == trained.digest
 
 
+def test_debug_makes_an_experiment_tiny_and_leaves_no_run_here(tmp_path, monkeypatch):
+    """2 s."""
+    monkeypatch.chdir(tmp_path)
+    few = purerl.train(str(TOY), {"ppo.num_envs": 4}, debug=True, seed=3)
+    assert few.config.num_envs == 4 and few.config.rollout_length == 32  # what is given stays
+    assert few.config.steps_per_update * few.config.num_updates == 1024
+    assert few.metrics()["eval/episode_return"][-1] is not None  # the evaluation ran, too
+    assert few.folder.name == "seed3" and not list(tmp_path.iterdir())
+    again = purerl.train(str(TOY), {"ppo.num_envs": 4}, debug=True, seed=3)
+    assert again.folder != few.folder and again.digest == few.digest
+    kept = purerl.train(str(TOY), debug=True, runs=tmp_path / "mine")
+    assert kept.folder.is_relative_to(tmp_path / "mine")
+
+
 def test_several_seeds_are_several_runs(trained, tmp_path):
     options = {"num_seeds": 2, "seeds_by": "map", "name": "many", "runs": tmp_path}
     first, second = purerl.train(str(TOY), SETTINGS, **options)
