@@ -70,7 +70,7 @@ def environments() -> Iterator[tuple[str, Any]]:
     """Yields name and environment of each body's experiment, then of each task of the suite."""
     for name in BODIES:
         experiment = purerl.find(name)
-        yield name, experiment.build_env(experiment.env, engine="c")
+        yield name, experiment.build_env(experiment.env, "c")
     for name in tasks.TASKS:
         yield name, tasks.build(tasks.Options(name), engine="c")
 
