@@ -5,6 +5,7 @@ import re
 
 import pytest
 
+from tests.docs import __main__ as command_line
 from tests.docs.blocks import EXECUTED, SHOWN, blocks, command, lone_markers, pages
 from tests.docs.play import run
 
@@ -76,6 +77,16 @@ def test_page_runs(name):
 def test_page_runs_each_night(name):
     done = run(PAGES[name])
     assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
+
+
+def test_pages_whose_code_a_change_touches_are_found(monkeypatch):
+    before = {name: path.read_text() for name, path in PAGES.items()}
+    before["README.md"] = before["README.md"].replace("```python", "```python\n# other code")
+    before["docs/howto/look.md"] += "\nOther words.\n"
+    del before["docs/howto/record.md"]
+    monkeypatch.setattr(command_line, "_page_at", lambda commit, name: before.get(name, ""))
+    touched = [PAGES["README.md"], PAGES["docs/howto/record.md"]]
+    assert command_line.changed_since("then") == touched
 
 
 PAGE = """# A page
