@@ -1,6 +1,7 @@
 """What all tests share."""
 
 import atexit
+import ctypes.util
 import gc
 import os
 import shutil
@@ -24,6 +25,9 @@ import hypothesis  # noqa: E402
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
+from purerl.core.errors import RunError  # noqa: E402
+from purerl.report.opengl import open_gl  # noqa: E402
+
 # The same examples every time: a failure belongs to the change that is tested.
 hypothesis.settings.register_profile("same", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("same")
@@ -32,6 +36,17 @@ jax.config.update("jax_debug_key_reuse", True)  # a key consumed twice raises
 
 # Files that take a minute or more, the longest first: begun last, one would run alone at the end.
 LONGEST = ("shards", "run", "interface", "seeds", "algorithm", "suite", "probes", "kill", "envs")
+
+
+@pytest.fixture(scope="session")
+def opengl():
+    """Skips a test that draws where nothing can be drawn, and says what to install."""
+    try:
+        open_gl(16, 16).free()
+    except RunError as error:
+        if ctypes.util.find_library("OSMesa"):
+            raise  # it needs no driver, so this is a fault of ours
+        pytest.skip(str(error))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -44,6 +59,10 @@ def garbage_is_collected_after_a_file():
     gc.freeze()  # what is left (JAX's caches) is not looked through again
 
 
-def pytest_collection_modifyitems(items):
+def pytest_collection_modifyitems(config, items):
+    if "nightly" not in config.option.markexpr:
+        nightly = [item for item in items if item.get_closest_marker("nightly")]
+        config.hook.pytest_deselected(items=nightly)
+        items[:] = [item for item in items if item not in nightly]
     rank = {f"test_{name}.py": number for number, name in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.name, len(rank)))

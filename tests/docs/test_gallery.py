@@ -35,6 +35,7 @@ def test_poses_are_of_tasks_that_there_are():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("opengl")
 def test_a_picture_shows_the_pose_that_is_asked_for():
     env = pendulum.build(engine="c")
     hanging, up = (gallery.Pose(joints={"hinge": angle}, zoom=1.5) for angle in (3.14, 0.0))

@@ -5,11 +5,16 @@ import re
 
 import pytest
 
+from tests.docs import __main__ as command_line
 from tests.docs.blocks import EXECUTED, SHOWN, blocks, command, lone_markers, pages
 from tests.docs.play import run
 
 PAGES = pages()
 RUN = [name for name, path in PAGES.items() if any(b.runs for b in blocks(path.read_text()))]
+# Seconds each. The other pages take a quarter of an hour: they are executed each night, and by
+# `.ci/run` where a change touches them.
+EACH_TIME = ("README.md", "docs/explanation/bits.md", "docs/reference/run_folder.md")
+EACH_TIME += tuple(f"docs/howto/{name}.md" for name in ("deploy", "look", "pandas", "record"))
 INSTALLS = re.compile(r"pip install|git clone|apt-get")
 
 
@@ -55,11 +60,33 @@ def test_wide_lines_are_found_but_not_in_tables_and_code():
     assert too_wide(f"```bash\n{wide}\n```\n{wide}\n") == [4]
 
 
+def test_pages_that_are_executed_each_time_are_there():
+    assert set(EACH_TIME) <= set(RUN)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", RUN)
+@pytest.mark.parametrize("name", EACH_TIME)
 def test_page_runs(name):
     done = run(PAGES[name])
     assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
+
+
+@pytest.mark.slow
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", [name for name in RUN if name not in EACH_TIME])
+def test_page_runs_each_night(name):
+    done = run(PAGES[name])
+    assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
+
+
+def test_pages_whose_code_a_change_touches_are_found(monkeypatch):
+    before = {name: path.read_text() for name, path in PAGES.items()}
+    before["README.md"] = before["README.md"].replace("```python", "```python\n# other code")
+    before["docs/howto/look.md"] += "\nOther words.\n"
+    del before["docs/howto/record.md"]
+    monkeypatch.setattr(command_line, "_page_at", lambda commit, name: before.get(name, ""))
+    touched = [PAGES["README.md"], PAGES["docs/howto/record.md"]]
+    assert command_line.changed_since("then") == touched
 
 
 PAGE = """# A page

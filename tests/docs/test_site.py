@@ -144,6 +144,7 @@ def test_a_notebook_is_kept_executed_and_small(path):
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
 def test_a_notebook_runs(path, tmp_path, monkeypatch):
     """With fewer steps."""

@@ -1,4 +1,4 @@
-"""`python -m purerl.render RUN`, and `--video` of a run. Needs OpenGL (libosmesa6)."""
+"""`python -m purerl.render RUN`, and `--video` of a run. Tests that draw need OpenGL."""
 
 import dataclasses
 import json
@@ -63,6 +63,7 @@ def only_line(capsys) -> str:
 # --- files ---
 
 
+@pytest.mark.usefixtures("opengl")
 def test_video_and_sheet_show_the_episode_in_real_time(trained, capsys):
     words = ["--size", "160x120", "--seconds", "0.8", "--episodes", "2"]
     assert render.main([str(trained), *words]) == 0
@@ -85,6 +86,7 @@ def test_video_and_sheet_show_the_episode_in_real_time(trained, capsys):
     assert "no episode above came to its end" in said
 
 
+@pytest.mark.usefixtures("opengl")
 def test_what_is_not_the_default_stands_in_the_name(trained, capsys):
     words = ["--size", "64x48", "--seed", "3", "--camera", "front"]
     assert render.main([str(trained), *words]) == 0
@@ -212,6 +214,7 @@ def reddish(frame: np.ndarray) -> np.ndarray:
     return (frame[..., 0] > 60) & (frame[..., 1] < 0.5 * frame[..., 0].astype(float))
 
 
+@pytest.mark.usefixtures("opengl")
 def test_changed_geometry_shows():
     model = room()
     bigger = {"geom_size": np.array([[5, 5, 1], [0.4, 0, 0]])}
@@ -231,6 +234,7 @@ def test_changed_geometry_shows():
     assert model.geom_size[1, 0] == 0.2  # the environment's own model is left alone
 
 
+@pytest.mark.usefixtures("opengl")
 def test_scenery_shows_and_is_forgotten():
     model = room()
     wall = (np.array([[0.0, -0.5, 1.0]]), np.array([[0.3, 0.05, 0.3]]))
@@ -250,6 +254,7 @@ def test_furniture_is_not_what_the_camera_follows():
     assert model.body(root_body(model)).name == "robot"
 
 
+@pytest.mark.usefixtures("opengl")
 def test_the_camera_follows_a_free_body_along_the_ground():
     model = room()
     start = [0, 0, 1, 1, 0, 0, 0]
@@ -283,6 +288,7 @@ def test_the_default_camera_is_the_one_that_follows(joint, cameras, expected):
 # --- mistakes ---
 
 
+@pytest.mark.usefixtures("opengl")
 def test_an_unknown_camera_or_checkpoint_lists_those_there_are(trained, capsys):
     assert render.main([str(trained), "--camera", "frot"]) == USAGE
     said = only_line(capsys)
@@ -307,6 +313,7 @@ def test_a_wrong_option_is_one_line(trained, words, part, capsys):
     assert part in only_line(capsys)
 
 
+@pytest.mark.usefixtures("opengl")
 def test_no_run_and_no_physics_are_one_line(tmp_path, capsys):
     assert render.main([str(tmp_path)]) == USAGE
     assert "no config.json" in only_line(capsys)
@@ -317,6 +324,7 @@ def test_no_run_and_no_physics_are_one_line(tmp_path, capsys):
     assert "cannot be drawn" in only_line(capsys)
 
 
+@pytest.mark.usefixtures("opengl")
 def test_settings_of_another_version_are_named(trained, tmp_path, capsys):
     copy = tmp_path / "run"
     shutil.copytree(trained, copy)
@@ -349,6 +357,7 @@ def test_a_backend_that_does_not_start_says_what_to_install(monkeypatch):
         opengl.open_gl(64, 48)
 
 
+@pytest.mark.usefixtures("opengl")
 def test_files_that_cannot_be_written_are_one_line(trained, tmp_path, capsys):
     copy = tmp_path / "run"
     shutil.copytree(trained, copy, ignore=shutil.ignore_patterns("videos"))
@@ -364,6 +373,7 @@ def test_files_that_cannot_be_written_are_one_line(trained, tmp_path, capsys):
 # --- with the run command ---
 
 
+@pytest.mark.usefixtures("opengl")
 def test_a_run_makes_a_video_and_learns_the_same(trained, place, capsys):
     folder = train(place, "with-video", "--video")
     assert capsys.readouterr().out.splitlines()[-1].endswith("000000000003.mp4")

@@ -100,6 +100,7 @@ def test_wandb_has_the_video_and_its_sheet(video):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("opengl")
 def test_the_command_logs_what_it_draws(tmp_path, capsys):
     words = ["cartpole_swingup", "--runs", str(tmp_path), *TINY.split()]
     assert run.main([*words, "--video", "--tensorboard"]) == 0
