@@ -85,21 +85,21 @@ def find_source(name: str) -> Source:
     if name.endswith(".py") or "/" in name:
         if not Path(name).is_file():
             raise UserError(f"There is no experiment file {name}.")
-        return load(Path(name))
+        return load_file(Path(name))
     if name in named:
-        return load(named[name])
+        return load_file(named[name])
     spec = None
     with contextlib.suppress(ImportError, ValueError):
         spec = importlib.util.find_spec(name) if "." in name else None
     if spec is not None and str(spec.origin).endswith(".py"):
-        return load(Path(str(spec.origin)))
+        return load_file(Path(str(spec.origin)))
     if Path(name).exists() or Path(f"{name}.py").is_file():
         raise UserError(f"{name} is no Python file; an experiment is one, as {Path(name).stem}.py.")
     places = f" in {' or '.join(map(str, _folders()))}"
     raise UserError(unknown_name("experiment", name, named, places))
 
 
-def load(
+def load_file(
     path: Path, name: str = "", text: bytes | None = None, origin: Path | None = None
 ) -> Source:
     """Loads the experiment that a Python file defines as `experiment = Experiment(...)`.

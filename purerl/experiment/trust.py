@@ -46,7 +46,7 @@ def load_copy(copy: Path, text: bytes, name: str, original: Path, trust: bool) -
         remember(text, places[0])
     # What the code reads beside `__file__` is as trusted as the code, so the folder has no say.
     there = [place for place in places if place.is_file()] or places
-    return loading.load(copy, name, text, original if original in there else there[-1])
+    return loading.load_file(copy, name, text, original if original in there else there[-1])
 
 
 def known_places(text: bytes, name: str) -> list[Path]:

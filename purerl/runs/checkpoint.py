@@ -75,7 +75,7 @@ def save(folder: Path, leaves: Leaves, meta: dict[str, Any]) -> Path:
     return path
 
 
-def load(path: Path, abstract: PyTree, owners: Sequence[Owner] = ()) -> Saved:
+def load_checkpoint(path: Path, abstract: PyTree, owners: Sequence[Owner] = ()) -> Saved:
     """Reads one checkpoint and checks every hash.
 
     Args:
@@ -133,7 +133,7 @@ def newest(
         for folder, of in zip(folders, owners or [()] * len(folders), strict=True):
             path = path_of(folder, update)
             try:
-                found.append(load(path, abstract, of))
+                found.append(load_checkpoint(path, abstract, of))
             except DamagedError as error:
                 kept = checkpoint_folder.set_aside(path) if rename else path
                 say(f"Checkpoint of update {update} is damaged: {error}. It is kept as {kept}; "

@@ -27,7 +27,7 @@ FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE", "JAX_PLATFORMS", "JAX_ENA
 PORTABLE = "x86-64 with AVX2, portable"  # instead of a processor's model
 
 
-def collect(
+def describe_process(
     engine: str,
     builders: Iterable[Callable],
     kernels: str = "fixed",

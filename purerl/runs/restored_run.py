@@ -127,6 +127,8 @@ def _choose(run: Folder, update: str, abstract: TrainState, say: Say) -> checkpo
         valid = ", ".join(["latest", "best", *found])
         raise UserError(f"There is no checkpoint {update!r} in {folder}. Valid: {valid}.")
     try:
-        return checkpoint.load(checkpoint_folder.path_of(folder, int(number)), abstract, owners)
+        return checkpoint.load_checkpoint(
+            checkpoint_folder.path_of(folder, int(number)), abstract, owners
+        )
     except checkpoint_folder.DamagedError as error:
         raise UserError(f"The checkpoint of update {number} is damaged: {error}.") from error

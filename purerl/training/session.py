@@ -125,7 +125,7 @@ def _facts(
     builders = (chosen.build_env, chosen.build_network)
     kernels = exact.how_chosen(jax.default_backend())
     inexact = getattr(setup.env, "inexact", "")
-    facts = manifest.collect(setup.engine, builders, kernels, shards.number, inexact)
+    facts = manifest.describe_process(setup.engine, builders, kernels, shards.number, inexact)
     facts["model"] = objects.physics_hash(setup.env)
     facts["experiment_file"] = str(source.path)
     if options.vmapped_seeds > 1:

@@ -106,9 +106,9 @@ def test_a_program_that_needs_a_library_is_one_line(portable):
 
 def test_what_picks_the_cpu_among_devices_is_no_difference(portable, monkeypatch):
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
-    named = manifest.collect("c", [])
+    named = manifest.describe_process("c", [])
     monkeypatch.delenv("JAX_PLATFORMS")
-    assert manifest.differences(named, manifest.collect("c", [])) == []
+    assert manifest.differences(named, manifest.describe_process("c", [])) == []
 
 
 def test_a_manifest_that_does_not_say_so_is_not_portable():

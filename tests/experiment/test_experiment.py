@@ -60,22 +60,22 @@ def test_a_mistake_in_the_file_names_its_line(tmp_path):
     ]:
         (tmp_path / "bad.py").write_text(text)
         with pytest.raises(UserError, match=message):
-            loading.load(tmp_path / "bad.py")
+            loading.load_file(tmp_path / "bad.py")
 
 
 def test_a_module_beside_the_file_is_found_with_the_path_that_the_error_names(tmp_path):
     file = tmp_path / "mine.py"
     file.write_text("import rewards_beside\n")
     with pytest.raises(UserError) as error:
-        loading.load(file)
+        loading.load_file(file)
     assert "PYTHONPATH" not in str(error.value)
     (tmp_path / "rewards_beside.py").write_text("UPRIGHT = 1\n")
     with pytest.raises(UserError, match=f"PYTHONPATH={tmp_path}$"):
-        loading.load(file)
+        loading.load_file(file)
 
 
 def test_settings_survive_json():
-    chosen = loading.load(TOY).experiment
+    chosen = loading.load_file(TOY).experiment
     network = dataclasses.replace(chosen.network, policy_hidden=(5, 6))
     changed = dataclasses.replace(chosen, seed=7, network=network)
     values = json.loads(json.dumps(settings_json.to_json(changed)))
@@ -95,7 +95,7 @@ class Parts:
 
 
 def test_dataclasses_in_tuples_and_tuples_in_dicts_survive_json():
-    chosen = dataclasses.replace(loading.load(TOY).experiment, env=Parts())
+    chosen = dataclasses.replace(loading.load_file(TOY).experiment, env=Parts())
     env = Parts(several=(Part(2.0), Part(3.0)), named={"a": (3, 4), "b": (5,)})
     changed = dataclasses.replace(chosen, env=env)
     values = json.loads(json.dumps(settings_json.to_json(changed)))
@@ -103,7 +103,7 @@ def test_dataclasses_in_tuples_and_tuples_in_dicts_survive_json():
 
 
 def test_a_setting_that_could_not_be_read_back_is_refused_before_training():
-    source = loading.load(TOY)
+    source = loading.load_file(TOY)
     source = source._replace(experiment=dataclasses.replace(source.experiment, env=Parts()))
     resume.describe_config(source, source.experiment, {})
     chosen = dataclasses.replace(source.experiment, env=Parts(one=Part()))
@@ -128,7 +128,7 @@ def test_a_mistake_in_a_module_names_its_line(tmp_path, monkeypatch):
 
 
 def test_missing_and_unknown_settings_are_named():
-    chosen = loading.load(TOY).experiment
+    chosen = loading.load_file(TOY).experiment
     values = settings_json.to_json(chosen)
     del values["env"]["steps"]
     with pytest.raises(UserError, match="lacks env.steps"):
@@ -140,7 +140,7 @@ def test_missing_and_unknown_settings_are_named():
 
 
 def test_a_setting_that_json_cannot_hold_is_named():
-    chosen = loading.load(TOY).experiment
+    chosen = loading.load_file(TOY).experiment
     env = dataclasses.replace(chosen.env, name=len)
     with pytest.raises(UserError, match=r"env.name is a builtin_function"):
         settings_json.to_json(dataclasses.replace(chosen, env=env))

@@ -52,7 +52,7 @@ def main() -> None:
         }
         meta |= {"metrics_bytes": 0, "metrics_sha256": ""}
         path, writes = median(lambda: checkpoint.save(Path(folder), leaves, meta))
-        restored, restores = median(lambda: checkpoint.load(path, abstract).state)
+        restored, restores = median(lambda: checkpoint.load_checkpoint(path, abstract).state)
         assert state_arrays.digest_leaves(state_arrays.flatten(restored)) == meta["digest"]
         on_disk = sum(f.stat().st_size for f in path.rglob("*") if f.is_file())
     print(f"state     {memory.size(state):>12,} bytes in {len(leaves)} leaves")

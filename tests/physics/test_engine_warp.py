@@ -287,9 +287,9 @@ def test_an_ant_keeps_to_the_protocol(arena):
 
 
 def test_a_run_is_not_exact_and_says_of_which_version():
-    facts = manifest.collect("warp", [])
+    facts = manifest.describe_process("warp", [])
     assert facts["versions"]["warp-lang"] and not facts["bit_exact"]
-    assert "warp-lang" not in manifest.collect("c", [])["versions"]
+    assert "warp-lang" not in manifest.describe_process("c", [])["versions"]
 
 
 def test_it_is_never_chosen_by_itself():

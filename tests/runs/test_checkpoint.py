@@ -51,7 +51,7 @@ def largest_file(path: Path) -> Path:
 
 def test_a_state_comes_back_bit_for_bit(tmp_path):
     state = make_state(0.1)
-    saved = checkpoint.load(save(tmp_path, 5, 0.1), abstract())
+    saved = checkpoint.load_checkpoint(save(tmp_path, 5, 0.1), abstract())
     assert saved.meta["update"] == 5
     assert jax.tree.structure(saved.state) == jax.tree.structure(state)
     assert digest(saved.state) == digest(state) == saved.meta["digest"]
@@ -100,7 +100,7 @@ def test_a_bit_flipped_after_reading_is_noticed_and_its_leaf_named(tmp_path, mon
 
     monkeypatch.setattr(array_files, "read", flipped)
     with pytest.raises(UserError, match="params/w.x"):
-        checkpoint.load(path, abstract())
+        checkpoint.load_checkpoint(path, abstract())
 
 
 def test_no_flipped_bit_of_any_file_is_taken(tmp_path):
@@ -113,9 +113,9 @@ def test_no_flipped_bit_of_any_file_is_taken(tmp_path):
             damaged[place // 8] ^= 1 << (place % 8)
             file.write_bytes(damaged)
             with pytest.raises(checkpoint_folder.DamagedError, match=file.name):
-                checkpoint.load(path, abstract())
+                checkpoint.load_checkpoint(path, abstract())
         file.write_bytes(content)
-    assert digest(checkpoint.load(path, abstract()).state) == digest(make_state(1.0))
+    assert digest(checkpoint.load_checkpoint(path, abstract()).state) == digest(make_state(1.0))
 
 
 def damage_cut(path: Path):
@@ -160,7 +160,7 @@ def test_another_state_is_refused_with_the_leaf(tmp_path):
     path = save(tmp_path, 1)
     other = jax.eval_shape(lambda: make_state() | {"empty": jnp.zeros((2, 3))})
     with pytest.raises(UserError, match="leaf empty is .*0, 3.* in it and .*2, 3"):
-        checkpoint.load(path, other)
+        checkpoint.load_checkpoint(path, other)
 
 
 def test_the_newest_and_the_best_are_kept(tmp_path):

@@ -17,7 +17,7 @@ from purerl import exact
 from purerl.devices import programs
 from purerl.devices.shards import Shards
 from purerl.exact import xla_flags
-from purerl.experiment.loading import load
+from purerl.experiment.loading import load_file
 from purerl.experiment.objects import build
 from purerl.ppo import algorithm
 from purerl.ppo.config import Evaluation
@@ -67,7 +67,7 @@ def test_one_changed_value_is_named_and_nothing_else(facts, path):
 
 
 def test_the_fingerprint_follows_what_can_change_bits_only():
-    facts = manifest.collect("c", [])
+    facts = manifest.describe_process("c", [])
     mine = fingerprint({"seed": 1}, facts, b"source")
     assert fingerprint({"seed": 1}, facts | {"git_revision": "x", "run_id": "x"}, b"source") == mine
     others = [({"seed": 2}, facts, b"source"), ({"seed": 1}, facts | {"engine": "jax"}, b"source")]
@@ -76,8 +76,8 @@ def test_the_fingerprint_follows_what_can_change_bits_only():
 
 
 def test_a_manifest_says_whether_the_run_is_exact_and_what_prevents_it(monkeypatch):
-    assert manifest.collect("c", [])["bit_exact"] is True
-    warp = manifest.collect("warp", [])
+    assert manifest.describe_process("c", [])["bit_exact"] is True
+    warp = manifest.describe_process("warp", [])
     assert warp["bit_exact"] is False and "warp" in warp["inexact_because"][0]
 
 
@@ -114,14 +114,14 @@ def test_kernels_are_fixed_unless_the_user_wants_them_timed(monkeypatch, users, 
     assert (xla_flags.KEPT_TIMINGS in os.environ) == (RULES in after)
     assert os.environ["XLA_FLAGS"] == after
     assert exact.how_chosen("gpu") == chosen and exact.how_chosen("cpu") == "fixed"
-    reasons = manifest.collect("jax", [], exact.how_chosen("gpu"))["inexact_because"]
+    reasons = manifest.describe_process("jax", [], exact.how_chosen("gpu"))["inexact_because"]
     assert ["by timing" in reason for reason in reasons] == [True] * (chosen == "by timing")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["cartpole_swingup", "ant_run"])
 def test_no_update_has_a_sum_without_a_fixed_order(name):
-    source = load(ROOT / "experiments" / f"{name}.py").experiment
+    source = load_file(ROOT / "experiments" / f"{name}.py").experiment
     config, env, network, _ = build(dataclasses.replace(source, engine="jax"))
     update = functools.partial(algorithm.update, config, env, network)
     trace = jax.make_jaxpr(update)(programs.abstract_state(config, env, network))
@@ -129,7 +129,7 @@ def test_no_update_has_a_sum_without_a_fixed_order(name):
 
 
 def test_a_sum_without_a_fixed_order_is_found(monkeypatch):
-    config, env, network, _ = build(load(TOY).experiment)
+    config, env, network, _ = build(load_file(TOY).experiment)
 
     def apply(params, observation, carry):
         output, carry = network.apply(params, observation, carry)
@@ -158,7 +158,7 @@ def test_a_run_on_c_imports_no_other_engine():
         "from purerl.runs import manifest",
         "chosen = purerl.find('ant_run')",
         "setup = objects.build(chosen)",
-        "manifest.collect(setup.engine, [chosen.build_env, chosen.build_network])",
+        "manifest.describe_process(setup.engine, [chosen.build_env, chosen.build_network])",
         "assert setup.engine == 'c'",
         "print([name for name in sys.modules if name in ('mujoco.mjx', 'warp')])",
     ]

@@ -172,7 +172,7 @@ def test_a_lost_seed_is_named(tmp_path, stop_after, capsys):
     from purerl.runs.restored_run import restore
 
     setup = restore(folder(tmp_path, "seed2"), "latest", print).setup
-    state = checkpoint.load(path, programs.abstract_state(*setup[:3])).state
+    state = checkpoint.load_checkpoint(path, programs.abstract_state(*setup[:3])).state
     state = state.replace(params=jax.tree.map(lambda x: x * 1e30, state.params))
     leaves = state_arrays.flatten(state)
     checkpoint.save(path.parent, leaves, meta | {"digest": state_arrays.digest_leaves(leaves)})
