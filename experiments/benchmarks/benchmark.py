@@ -113,7 +113,13 @@ def make_bench(experiment: Experiment, names: Sequence[str] = PARTS) -> Bench:
         ("update", partial(algorithm.update, config, env, network), (state,), steps),
         (
             "evaluation",
-            partial(evaluate_policy, config, env, network, num_episodes=episodes),
+            partial(
+                evaluate_policy,
+                env,
+                network,
+                num_episodes=episodes,
+                episode_length=config.episode_length,
+            ),
             (state, key),
             None,
         ),
@@ -128,8 +134,8 @@ def learn(
     config: algorithm.Config, network: Network, state: TrainState, seen: algorithm.Experience
 ) -> tuple[TrainState, PyTree]:
     """The learner alone, on one rollout's experience."""
-    first = seen.number[:, 0]
-    return learner.learn(config, network, state, seen.batch, seen.memory, first, WHOLE)
+    part_ids = seen.env_ids[:, 0]
+    return learner.learn(config, network, state, seen.batch, seen.memory, part_ids, WHOLE)
 
 
 def compile_part(name: str, function: Callable, arguments: tuple, steps: int | None) -> Part:

@@ -32,7 +32,8 @@ def gaps_of(setup: objects.Setup, state: TrainState, seed: int, episodes: int) -
     """Evaluates deterministically in `episodes` corridors; the same seed gives the same ones."""
 
     def judge(state: TrainState, key: Array) -> dict[str, Array]:
-        return evaluate_policy(setup.config, setup.env, setup.network, state, key, episodes)
+        length = setup.config.episode_length
+        return evaluate_policy(setup.env, setup.network, state, key, episodes, length)
 
     key = derive(jax.random.key(seed), Purpose.EVALUATION)
     return jax.device_get(jax.jit(judge)(state, key))

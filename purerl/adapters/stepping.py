@@ -13,7 +13,7 @@ from purerl.core.env import Env, State
 from purerl.core.errors import UserError
 from purerl.core.records import Array, PyTree
 from purerl.physics import drawing
-from purerl.ppo.rollout import is_lost
+from purerl.ppo.episodes import is_lost
 
 
 def sound_step(env: Env) -> Callable[[State, Array], tuple[State, Array]]:

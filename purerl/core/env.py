@@ -50,7 +50,12 @@ class Env(Protocol):
         """Starts an episode; a pure function of a typed key []."""
 
     def step(self, state: State, action: Array) -> State:
-        """Advances one control step; pure; `action` [A] in [-1, 1]."""
+        """Advances one control step; pure.
+
+        Args:
+          state: of one environment, unbatched; its `terminated` and `truncated` are not read.
+          action: [A] in [-1, 1].
+        """
 
 
 class EnvError(ValueError):

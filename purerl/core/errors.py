@@ -31,6 +31,10 @@ class StoppedError(Exception):
 def nearest(name: str, valid: Iterable[str]) -> str:
     """Returns the valid name that a wrong one is surely meant to be, or "".
 
+    Args:
+      name: the wrong name.
+      valid: the names there are.
+
     >>> nearest("ppo.learing_rate", ["ppo.clip", "ppo.learning_rate"])
     'ppo.learning_rate'
     >>> nearest("ppo.lr", ["ppo.clip", "ppo.learning_rate"])  # its initials

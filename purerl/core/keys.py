@@ -25,12 +25,25 @@ class Purpose(enum.IntEnum):
 
 
 def derive(key: Array, purpose: Purpose, *indices: Array | int) -> Array:
-    """Returns the key of one use: `key` [] folded with the purpose and then each index []."""
+    """Returns the key of one use, [].
+
+    Args:
+      key: [] typed key of the run's seed, which is never used itself.
+      purpose: what the key is for.
+      indices: [] each, integers: which of the purpose's uses, such as the update.
+    """
+    # The purpose comes first, so that no index of one purpose can meet the key of another.
     for index in (int(purpose), *indices):
         key = jax.random.fold_in(key, index)
     return key
 
 
-def per_environment(key: Array, numbers: Array) -> Array:
-    """Returns one key for each environment, [B], from the environments' `numbers` [B]."""
-    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, numbers)
+def per_environment(key: Array, env_ids: Array) -> Array:
+    """Returns one key for each environment, [B].
+
+    Args:
+      key: [] typed, unbatched.
+      env_ids: [B] int32. An environment's key depends on its own id alone, so it is the same
+        whichever other environments are computed beside it.
+    """
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, env_ids)

@@ -30,6 +30,8 @@ class Parts(NamedTuple):
 
 def add_in_order(x: Array) -> Array:
     """Returns the sum over the first axis, [V, ...] -> [...], by halves: one fixed tree."""
+    # Floating-point addition is not associative. `x.sum(0)` leaves the order to the compiler; here
+    # the order depends on V alone.
     while x.shape[0] > 1:
         half = x.shape[0] // 2
         x = jnp.concatenate([x[:half] + x[half : 2 * half], x[2 * half :]])
@@ -37,7 +39,13 @@ def add_in_order(x: Array) -> Array:
 
 
 def _only(function: Callable, *trees: PyTree) -> PyTree:
-    """Returns `function` of the only part, without the part axis."""
+    """Returns `function` of the only part.
+
+    Args:
+      function: takes one part's trees, [...].
+      trees: leaves [1, ...].
+    """
+    # `squeeze` refuses an axis of another size than 1: two parts given to `WHOLE` are an error.
     return function(*jax.tree.map(lambda x: jnp.squeeze(x, 0), trees))
 
 

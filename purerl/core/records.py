@@ -9,13 +9,18 @@ Shapes, everywhere in this project, time first (`[T, B, ...]`):
 | `M`    | samples in one minibatch               |
 | `O`    | observation features                   |
 | `A`    | action features                        |
-| `H`    | features of a recurrent carry          |
+| `H`    | features of a recurrent memory         |
 | `S`    | seeds                                  |
 | `N`    | evaluation episodes                    |
 | `V`    | parts of a batch (`core/parts.py`)     |
+| `E`    | epochs over one rollout                |
+| `K`    | minibatches in one epoch               |
 
 `[]` is a scalar, `[...]` any leading batch axes. A docstring that says `[O]` describes one
-environment; the caller's `vmap` adds `[B, O]`.
+environment, unbatched; the caller's `vmap` makes it `[B, O]`.
+
+What a recurrent network keeps from one step to the next is its memory. The field of `TrainState` is
+called `carry`, and its environments' states `env`: field names are part of a checkpoint's digest.
 """
 
 from collections.abc import Callable
@@ -47,10 +52,11 @@ class PolicyOutput(NamedTuple):
 class Network(NamedTuple):
     """A policy and value function as a pair of pure functions.
 
-    `init(key) -> (params, carry)`: parameters, and one environment's carry at the start of an
-    episode, which must be all zeros (a feed-forward network returns `()`).
-    `apply(params, observation, carry) -> (PolicyOutput, carry)`: accepts any leading batch axes,
-    the same on `observation` and `carry`.
+    `init(key) -> (params, memory)`: from a key [], the parameters, and the memory of one
+    environment, unbatched, at the start of an episode. That memory must be all zeros; a
+    feed-forward network returns `()`.
+    `apply(params, observation, memory) -> (PolicyOutput, memory)`: `observation` has any leading
+    batch axes, leaves [..., O], and `memory` has the same ones, leaves [..., H]. `params` has none.
     """
 
     init: Callable[[Array], tuple[PyTree, PyTree]]
@@ -69,9 +75,15 @@ def zero_count() -> Counter:
     return Counter(high=jnp.zeros((), jnp.uint32), low=jnp.zeros((), jnp.uint32))
 
 
-def add_count(count: Counter, number: Array) -> Counter:
-    """Adds `number` ([] integer, at least 0, below 2**32) exactly."""
-    low = count.low + number.astype(jnp.uint32)
+def add_count(count: Counter, amount: Array) -> Counter:
+    """Adds exactly.
+
+    Args:
+      count: the counter so far.
+      amount: [] integer, at least 0 and below 2**32.
+    """
+    low = count.low + amount.astype(jnp.uint32)
+    # Unsigned addition wraps around: the sum is below what it began with exactly if one is carried.
     return Counter(high=count.high + (low < count.low), low=low)
 
 
@@ -101,12 +113,13 @@ class TrainState(struct.PyTreeNode):
     params: PyTree
     optimizer: PyTree  # Adam's moments of all parameters
     learning_rate: Array  # [] float32; moves only under the adaptive-KL schedule
-    normalizer: PyTree  # normalizer.Statistics of the observation
-    reward_normalizer: PyTree  # normalizer.Statistics of the discounted return, [] each
-    # Where the environments are.
-    number: Array  # [B] int32 each environment's number, which its random keys are folded with
-    env: PyTree  # env.State, [B, ...]
-    carry: PyTree  # the policy's memory, [B, ...]; () for a feed-forward network
+    normalizer: PyTree  # running_moments.Statistics of the observation
+    reward_normalizer: PyTree  # running_moments.Statistics of the discounted return, [] each
+    # Where the environments are. A digest hashes the names of fields, so it is at the next change
+    # of bits that `number`, `env` and `carry` become `env_ids`, `env_state` and `memory`.
+    number: Array  # [B] int32 each environment's id, which its random keys are folded with
+    env: PyTree  # core.env.State, [B, ...]
+    carry: PyTree  # the policy's memory, [B, H]; () for a feed-forward network
     episode: EpisodeStats  # [B]
     discounted_return: Array  # [B] running return, for reward scaling
     # Bookkeeping.

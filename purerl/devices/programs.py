@@ -112,7 +112,7 @@ def evaluate_in_run(
 ) -> Metrics:
     """Evaluates the deterministic policy on episodes that depend on seed and update alone."""
     key = derive(state.key, Purpose.EVALUATION, state.update)
-    return evaluate_policy(config, env, network, state, key, num_episodes)
+    return evaluate_policy(env, network, state, key, num_episodes, config.episode_length)
 
 
 def compile_update(

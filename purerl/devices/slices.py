@@ -49,7 +49,7 @@ def cut_in_slices(number: int, experience: Experience) -> Experience:
     return experience._replace(
         batch=cut(2, experience.batch),
         memory=cut(1, experience.memory),
-        number=cut(1, experience.number),
+        env_ids=cut(1, experience.env_ids),
     )
 
 

@@ -29,7 +29,7 @@ _BLOWN_UP = [
 
 
 class CEngine:
-    """Steps a model with MuJoCo's C code; see `physics.Physics` for what `init`, `step` promise."""
+    """Steps a model with MuJoCo's C code; `interface.Physics` says what the functions promise."""
 
     def __init__(self, model: mujoco.MjModel, record: Any, stage: int, substeps: int):
         """Copies the model; simulations are allocated when the batch size is known.

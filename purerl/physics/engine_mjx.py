@@ -21,7 +21,7 @@ _IN_IMPL += ("subtree_angmom", "cacc", "cfrc_int", "cfrc_ext")
 
 
 class JaxEngine:
-    """Steps a model with MJX; see `physics.Physics` for what `init` and `step` promise."""
+    """Steps a model with MJX; see `interface.Physics` for what `init` and `step` promise."""
 
     def __init__(
         self,

@@ -4,8 +4,8 @@ It runs on a CPU too, slowly: that is for tests. There it is exact; on a GPU its
 atomics, in any order.
 
 What is batched here is the control step, not the physics step: `vmap` of a control step becomes
-one call for MJX-Warp's own batch (`warp_batch.py`), and the size of the batch, which one simulation
-cannot know, decides how much room contacts get.
+one call for MJX-Warp's own batch (`warp_buffers.py`), and the size of the batch, which one
+simulation cannot know, decides how much room contacts get.
 """
 
 import copy
@@ -48,7 +48,7 @@ _PLACES = {"geom_pos", "geom_quat", "body_pos", "body_quat"}
 
 
 class WarpEngine:
-    """Steps a model with MJX-Warp; see `physics.Physics` for what `init` and `step` promise."""
+    """Steps a model with MJX-Warp; see `interface.Physics` for what `init` and `step` promise."""
 
     def __init__(self, model: mujoco.MjModel, record: Any, late: tuple[str, ...], substeps: int):
         """Prepares the model; memory on a device is taken when a batch is first stepped there.

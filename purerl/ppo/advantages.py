@@ -14,13 +14,26 @@ def temporal_difference(
 ) -> Array:
     """Returns delta_t = r_t + gamma * V(s'_t) * (1 - terminated_t) - V(s_t), [T].
 
-    `next_value` [T] is the value of the observation that the step led to, before any reset.
+    Args:
+      reward: [T] scaled reward, of one trajectory, unbatched, as all that follows.
+      value: [T] V(s_t).
+      next_value: [T] V(s'_t), the value of the observation that the step led to, before any reset.
+      terminated: [T] bool: nothing comes after the step.
+      gamma: discount.
     """
+    chex.assert_equal_shape([reward, value, next_value, terminated])
+    # `where`, not a product: the value of what comes after an end may be NaN, as 0 times NaN is.
     return reward + gamma * jnp.where(terminated, 0.0, next_value) - value
 
 
 def discounted_sum(delta: Array, decay: Array) -> Array:
-    """Returns x_t = delta_t + decay_t * x_{t+1} with x_T = 0, [T]."""
+    """Returns x_t = delta_t + decay_t * x_{t+1} with x_T = 0, [T].
+
+    Args:
+      delta: [T] of one trajectory, unbatched.
+      decay: [T] how much of the sum after a step counts at that step.
+    """
+    chex.assert_equal_shape([delta, decay])
 
     def backward(following: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
         delta_t, decay_t = step
@@ -46,7 +59,7 @@ def gae(
     """Returns A_t = delta_t + gamma * lambda * (1 - done_t) * A_{t+1}, [T].
 
     Args:
-      reward: [T] scaled reward.
+      reward: [T] scaled reward, of one trajectory, unbatched, as all that follows.
       value: [T] V(s_t).
       next_value: [T] V(s'_t), also at a truncation, where s'_t is the state before the reset.
       terminated: [T] bool, nothing comes after.
@@ -56,8 +69,10 @@ def gae(
       gamma: discount.
       lambda_: decay of the trace, the paper's lambda.
     """
-    chex.assert_equal_shape([reward, value, next_value, terminated, done, valid])
     chex.assert_rank(reward, 1)
+    chex.assert_equal_shape([reward, value, next_value, terminated, done, valid])
+    chex.assert_type([reward, value, next_value, terminated, done, valid], [float] * 3 + [bool] * 3)
     delta = temporal_difference(reward, value, next_value, terminated, gamma)
     delta = jnp.where(valid, delta, 0.0)
+    # A truncation is bootstrapped in delta but cut in the trace: the next row is another episode's.
     return discounted_sum(delta, jnp.where(done | ~valid, 0.0, gamma * lambda_))

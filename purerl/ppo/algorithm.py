@@ -4,6 +4,10 @@ An update, in the order in which you would explain it: `collect` acts and estima
 (`rollout.py`, `batches.py`); `improve` learns (`learner.py`), then updates the statistics of
 observations and returns (`running_moments.py`). `init` and `update` are pure. Jit each as a whole,
 once: their bits depend on it.
+
+A batch is computed in V parts, and the record `Parts` says how (`core/parts.py`). `WHOLE` is the
+simplest: one part, V = 1, called as it is. Read with it in mind; who has several parts calls
+`collect` for each and `improve` for all.
 """
 
 from typing import NamedTuple
@@ -15,13 +19,13 @@ from purerl.core.env import Env
 from purerl.core.keys import Purpose, derive, per_environment
 from purerl.core.parts import WHOLE, Parts, add_in_order, as_one_part
 from purerl.core.records import Array, Metrics, Network, PyTree, TrainState, add_count, zero_count
-from purerl.ppo import running_moments
+from purerl.ppo import episodes, running_moments
 from purerl.ppo.batches import Batch, make_batch
 from purerl.ppo.config import Config
 from purerl.ppo.learner import learn
 from purerl.ppo.optimizer import optimizer
-from purerl.ppo.rollout import Transition, rollout, start_episodes, time_limits
-from purerl.ppo.running_moments import Moments
+from purerl.ppo.rollout import Transition, rollout
+from purerl.ppo.running_moments import Moments, deviations, merge, pool
 
 
 class Experience(NamedTuple):
@@ -29,17 +33,20 @@ class Experience(NamedTuple):
 
     batch: Batch  # [V, T, B, ...]
     memory: PyTree  # [V, B, H] the policy's at the start of the rollout
-    number: Array  # [V, B] the environments' numbers
-    observations: Moments  # [V, ...]
-    returns: Moments  # [V] of the discounted return
-    sums: Metrics  # name -> [V]
+    env_ids: Array  # [V, B] int32
+    observations: Moments  # [V, O] each
+    returns: Moments  # [V] each, of the discounted return
+    sums: Metrics  # name -> [V] over steps and environments
 
 
 def init(config: Config, env: Env, network: Network, key: Array) -> TrainState:
-    """Returns the state before the first update, all of it drawn from `key` [].
+    """Returns the state before the first update.
 
-    The first episodes' time limits are uniform in 1 to the environment's own, so that environments
-    do not stay in phase: B environments all at the same moment of an episode are one sample.
+    Args:
+      config: the hyperparameters.
+      env: the environment, unbatched.
+      network: the policy and value function.
+      key: [] typed, of the run's seed; all of the state is drawn from it.
 
     >>> env = purerl.envs.cartpole_swingup.build()
     >>> config = purerl.Config(num_steps=8192, num_envs=8, rollout_length=32, num_minibatches=4)
@@ -51,23 +58,25 @@ def init(config: Config, env: Env, network: Network, key: Array) -> TrainState:
     >>> int(state.update), state.discounted_return.shape
     (0, (8,))
     """
-    params, carry = network.init(derive(key, Purpose.PARAMETERS))
-    size, number = config.num_envs, jnp.arange(config.num_envs, dtype=jnp.int32)
-    env_state = jax.vmap(env.reset)(per_environment(derive(key, Purpose.FIRST_RESET), number))
-    limit_keys = per_environment(derive(key, Purpose.FIRST_LIMIT), number)
-    limit = jax.vmap(lambda k, longest: jax.random.randint(k, (), 1, longest + 1))(
-        limit_keys, time_limits(config, number)
-    )
+    params, memory = network.init(derive(key, Purpose.PARAMETERS))
+    size, env_ids = config.num_envs, jnp.arange(config.num_envs, dtype=jnp.int32)
+    env_state = jax.vmap(env.reset)(per_environment(derive(key, Purpose.FIRST_RESET), env_ids))
+    # The first time limits are uniform in 1 to the environment's own, so that environments do not
+    # stay in phase: B environments all at the same moment of an episode are one sample.
+    limit_keys = per_environment(derive(key, Purpose.FIRST_LIMIT), env_ids)
+    longest = episodes.time_limits(config, env_ids)
+    limit = jax.vmap(lambda k, most: jax.random.randint(k, (), 1, most + 1))(limit_keys, longest)
     return TrainState(
         params=params,
         optimizer=optimizer(config).init(params),
         learning_rate=jnp.asarray(config.learning_rate, jnp.float32),
         normalizer=running_moments.init(jax.tree.map(lambda x: x[0], env_state.observation)),
         reward_normalizer=running_moments.init(jnp.zeros(())),
-        number=number,
+        number=env_ids,
         env=env_state,
-        carry=jax.tree.map(lambda x: jnp.broadcast_to(x, (size, *x.shape)), carry),
-        episode=start_episodes(env_state, limit.astype(jnp.int32)),
+        # Zeros, as `Network.init` promises: nobody remembers anything at the start of an episode.
+        carry=jax.tree.map(lambda x: jnp.broadcast_to(x, (size, *x.shape)), memory),
+        episode=episodes.start_episodes(env_state, limit.astype(jnp.int32)),
         discounted_return=jnp.zeros(size),
         key=key,
         update=jnp.zeros((), jnp.int32),
@@ -81,15 +90,21 @@ def update(
 ) -> tuple[TrainState, Metrics]:
     """Makes one rollout of T steps in B environments, then E epochs of K minibatches.
 
+    Args:
+      config: the hyperparameters.
+      env: the environment, unbatched.
+      network: the policy and value function.
+      state: from `init` or the update before.
+
     Returns:
-      The next state, and metrics, name -> [] float32. Observation and return statistics stay as
-      they are until the end, so that the first policy ratio is exactly 1.
+      The next state, and metrics, name -> [] float32.
 
     >>> step = jax.jit(functools.partial(purerl.update, config, env, network))  # those of `init`
     >>> state, metrics = step(state)
     >>> int(state.update), metrics["reward"].shape
     (1, ())
     """
+    # Two functions, because parts are collected one by one and learned from together.
     state, experience = collect(config, env, network, state)
     return improve(config, network, state, experience)
 
@@ -99,20 +114,26 @@ def collect(
 ) -> tuple[TrainState, Experience]:
     """Acts for T steps in the environments of `state`, all of them or those of one part.
 
+    Args:
+      config: the hyperparameters.
+      env: the environment, unbatched.
+      network: the policy and value function.
+      state: of B environments.
+
     Returns:
       `state` with its environments moved on, and what was seen, as one part [1, ...].
     """
-    memory, opening = state.carry, state.episode.length == 0
+    # Read before the rollout moves `state` on: what the policy remembered at the first step, and
+    # which environments began an episode with it. The learner unrolls the network from there.
+    memory, is_first = state.carry, state.episode.length == 0
     state, transitions, sums, last_value = rollout(config, env, network, state)
     valid, seen = transitions.valid, transitions.observation
     experience = Experience(
-        batch=make_batch(config, state, transitions, last_value, opening),
+        batch=make_batch(config, state, transitions, last_value, is_first),
         memory=memory,
-        number=state.number,
-        observations=running_moments.deviations(state.normalizer, seen, valid),
-        returns=running_moments.deviations(
-            state.reward_normalizer, transitions.discounted_return, valid
-        ),
+        env_ids=state.number,
+        observations=deviations(state.normalizer, seen, valid),
+        returns=deviations(state.reward_normalizer, transitions.discounted_return, valid),
         sums=rollout_sums(transitions, sums),
     )
     return state, as_one_part(experience)
@@ -125,11 +146,25 @@ def improve(
     experience: Experience,
     parts: Parts = WHOLE,
 ) -> tuple[TrainState, Metrics]:
-    """Learns from what all parts have collected; does not read the environments in `state`."""
-    batch, memory, number, *rest = experience
-    state, learning = learn(config, network, state, batch, memory, number[:, 0], parts)
-    observations, returns, sums = parts.gather(rest)
-    pool, merge = running_moments.pool, running_moments.merge
+    """Learns from what all parts have collected.
+
+    Args:
+      config: the hyperparameters.
+      network: the policy and value function.
+      state: for what is learned; its environments are not read.
+      experience: [V, ...] of all parts.
+      parts: how the V parts are computed.
+
+    Returns:
+      `state` with what was learned, and metrics, name -> [] float32.
+    """
+    part_ids = experience.env_ids[:, 0]  # no environment is in two parts, so its id names the part
+    batch, memory = experience.batch, experience.memory
+    state, learning = learn(config, network, state, batch, memory, part_ids, parts)
+    seen = experience.observations, experience.returns, experience.sums
+    observations, returns, sums = parts.gather(seen)
+    # Statistics move only here, after the last step. While they stood still, the learner normalized
+    # as the policy that acted did, so that its first ratio was exactly 1.
     state = state.replace(
         normalizer=merge(state.normalizer, pool(observations)),
         reward_normalizer=merge(state.reward_normalizer, pool(returns)),
@@ -140,11 +175,16 @@ def improve(
 
 
 def rollout_sums(transitions: Transition, sums: Metrics) -> Metrics:
-    """Returns sums over steps and environments, name -> []; from `sums` of each environment [B]."""
-    valid, resets = transitions.valid.astype(jnp.float32), sums.pop("resets")
-    replayed = jnp.maximum(resets - 1, 0).astype(jnp.float32)  # an update has one fresh start each
-    sums |= {"valid": valid, "reward": valid * transitions.reward, "replayed_resets": replayed}
-    return {name: x.sum() for name, x in sums.items()}
+    """Returns sums over steps and environments, name -> [].
+
+    Args:
+      transitions: [T, B, ...].
+      sums: over the episodes that ended in each environment, name -> [B].
+    """
+    sound = transitions.valid.astype(jnp.float32)
+    replayed = jnp.maximum(sums["resets"] - 1, 0).astype(jnp.float32)  # one start is fresh
+    more = {"sound_steps": sound, "reward": sound * transitions.reward, "replayed_resets": replayed}
+    return {name: x.sum() for name, x in (sums | more).items() if name != "resets"}
 
 
 def rollout_metrics(sums: Metrics) -> Metrics:
@@ -152,10 +192,9 @@ def rollout_metrics(sums: Metrics) -> Metrics:
 
     The reward is the mean over sound steps: NaN if there was none.
     """
-    sums = dict(sums)
-    reward = sums.pop("reward") / sums.pop("valid")
-    episodes = jnp.maximum(sums["episodes"], 1.0)
-    means = {
-        k: x / episodes for k, x in sums.items() if k.startswith("episode") and k != "episodes"
-    }
-    return {"reward": reward} | sums | means
+    reward = sums["reward"] / sums["sound_steps"]
+    # If no episode ended, its means are 0, and the count of episodes says so.
+    ended = jnp.maximum(sums["episodes"], 1.0)
+    means = {k: x / ended for k, x in sums.items() if k.startswith(("episode_", "episode/"))}
+    counts = {k: x for k, x in sums.items() if k not in ("reward", "sound_steps")}
+    return {"reward": reward} | counts | means

@@ -1,5 +1,6 @@
 """What the losses read: a rollout with advantages and value targets."""
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -17,48 +18,75 @@ class Batch(NamedTuple):
 
     observation: PyTree  # [..., O] normalized
     raw_action: Array  # [..., A]
-    noise: Normal | None  # [..., A] of the action, given that before; None: white
-    log_prob: Array  # [...] under the policy that acted and such noise
-    old_value: Array  # [...]
+    noise: Normal | None  # [..., A] of the action's noise, as `Transition` has it
+    log_prob: Array  # [...] under the policy that acted, with that noise
+    old_value: Array  # [...] V(s_t), of the policy that acted
     advantage: Array  # [...]
     target: Array  # [...] of the value
+    # float32 of `Transition.valid`, since the losses multiply by it; where moments are computed,
+    # `weight > 0` is the bool again. One bool for both would compile to another program: it waits
+    # for the next change of bits.
     weight: Array  # [...] 0 where the physics blew up, else 1
-    first: Array  # [...] bool: an episode begins here, so the memory starts from zero
+    is_first: Array  # [...] bool: an episode begins here, so the memory starts from zero
 
 
 def reward_factor(config: Config, state: TrainState) -> Array:
-    """Returns what rewards are multiplied by before learning, []."""
+    """Returns what rewards are multiplied by before learning, [].
+
+    Args:
+      config: how rewards are scaled.
+      state: for the variance of the discounted return.
+    """
     if config.reward_scaling == "constant":
         return jnp.asarray(config.reward_scale, jnp.float32)
     variance = state.reward_normalizer.variance.value
+    # Divided by the deviation, but not centred: a shift of rewards would change what is optimal.
     return config.reward_scale * jax.lax.rsqrt(variance + running_moments.VARIANCE_FLOOR)
 
 
 def estimate(
     config: Config, state: TrainState, transitions: Transition, last_value: Array
 ) -> Array:
-    """Returns the advantages of a rollout, [T, B]; `last_value` [B] is of what follows it."""
+    """Returns the advantages of a rollout, [T, B].
+
+    Args:
+      config: gamma, lambda and the scale of rewards.
+      state: for the scale of rewards, unbatched.
+      transitions: [T, B, ...].
+      last_value: [B] V of the observation that follows the rollout.
+    """
     value = transitions.value
+    # The next row's value is that of s'_t, unless an episode ended. Where one was truncated, the
+    # rollout has kept V(s'_t). Where one terminated or was lost, `gae` does not read it.
     following = jnp.concatenate([value[1:], last_value[None]])
-    return jax.vmap(gae, in_axes=(1, 1, 1, 1, 1, 1, None, None), out_axes=1)(
+    of_one = functools.partial(gae, gamma=config.gamma, lambda_=config.gae_lambda)
+    return jax.vmap(of_one, in_axes=1, out_axes=1)(
         transitions.reward * reward_factor(config, state),
         value,
         jnp.where(transitions.truncated, transitions.truncation_value, following),
         transitions.terminated,
         transitions.done,
         transitions.valid,
-        config.gamma,
-        config.gae_lambda,
     )
 
 
 def make_batch(
-    config: Config, state: TrainState, transitions: Transition, last_value: Array, first: Array
+    config: Config, state: TrainState, transitions: Transition, last_value: Array, is_first: Array
 ) -> Batch:
-    """Computes advantages and value targets of a rollout, [T, B].
+    """Computes advantages and value targets of a rollout.
 
-    `state` is the one after it, `last_value` [B] that of its observation, `first` [B] opens it.
+    Args:
+      config: the hyperparameters.
+      state: for the statistics, which are those that the policy acted by.
+      transitions: [T, B, ...].
+      last_value: [B] V of the observation that follows the rollout.
+      is_first: [B] bool: the rollout's first step is also an episode's.
+
+    Returns:
+      The batch, [T, B, ...].
     """
+    # Computed once. Through all epochs the advantages and the targets are those of the policy that
+    # acted, so no gradient passes through them.
     advantage = estimate(config, state, transitions, last_value)
     return Batch(
         observation=running_moments.normalize(state.normalizer, transitions.observation),
@@ -69,7 +97,8 @@ def make_batch(
         advantage=advantage,
         target=advantage + transitions.value,
         weight=transitions.valid.astype(jnp.float32),
-        first=jnp.concatenate([first[None], transitions.done[:-1]]),
+        # Whatever follows a step that is done is the first of its episode.
+        is_first=jnp.concatenate([is_first[None], transitions.done[:-1]]),
     )
 
 

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from purerl.core.records import PyTree
 
-COUNTS = 2**31  # int32, in which updates, samples and steps of an episode are counted, ends below
+# int32, in which updates, samples and steps of an episode are counted, ends below this.
+COUNTS = 2**31
 SIZE = "at least 1 and below 2**31 - 1", lambda x: 1 <= x < COUNTS - 1
 # What a setting must be, how that is told, and the names of those that must be so.
 TRAINING = (
@@ -27,10 +28,16 @@ EVALUATION = (
 
 
 def check_rules(settings: Any, rules: tuple) -> None:
-    """Checks every setting by itself."""
+    """Checks every setting by itself; raises ValueError for the first that breaks its rule.
+
+    Args:
+      settings: a dataclass.
+      rules: a row each: the rule in words, whether a number keeps it, and the settings it is for.
+    """
     for rule, holds, names in rules:
         for name in names.split():
             value = getattr(settings, name)
+            # A comparison with NaN is False, so NaN breaks every rule.
             if isinstance(value, str) or not holds(value):
                 raise ValueError(f"{name} is {value!r}; it must be {rule}.")
 
@@ -51,15 +58,15 @@ def check_budget(config: Any) -> None:
 
 def check_observation(observation: "PyTree") -> None:
     """Checks that an observation is an array [O], or a flat dict of such."""
-    parts = observation if isinstance(observation, dict) else {"policy": observation}
-    if "policy" not in parts:
+    entries = observation if isinstance(observation, dict) else {"policy": observation}
+    if "policy" not in entries:
         raise ValueError(
-            f"The observation is a dict of {', '.join(sorted(parts))}; the entry that the policy "
+            f"The observation is a dict of {', '.join(sorted(entries))}; the entry that the policy "
             "may read must be called policy (the value function reads all)."
         )
-    for name, part in parts.items():
-        if getattr(part, "ndim", None) != 1:
-            shape, kind = getattr(part, "shape", None), type(part).__name__
+    for name, entry in entries.items():
+        if getattr(entry, "ndim", None) != 1:
+            shape, kind = getattr(entry, "shape", None), type(entry).__name__
             what = f"a {kind}" if shape is None else f"of shape {shape}"
             raise ValueError(
                 f"The observation's part {name} is {what}; this network takes arrays [O]: flatten "

@@ -22,7 +22,8 @@ class Config:
     """Gradient steps in one pass."""
     episode_length: int = 1000
     """Time limit of an episode [control steps]; reaching it truncates."""
-    shortest_episode: int = 32  # where the goal is reached soon, a start is what is to be learned
+    # Where the goal is reached soon, a start is what is to be learned.
+    shortest_episode: int = 32
     """Time limit of the first environment's training episodes [control steps]; the others' rise
     to `episode_length`, evenly in their logarithm. 0, or not below that: all are that long."""
     gamma: float = 0.99
@@ -31,17 +32,21 @@ class Config:
     """Decay of the advantage trace, lambda."""
     clip: float = 0.2
     """Range of the policy ratio, 1 +- clip."""
-    advantage_clip: float = 4.0  # one fall of a pole that always stood undid a policy
+    # One fall of a pole that always stood undid a policy.
+    advantage_clip: float = 4.0
     """Range of the normalized advantage, +- so many standard deviations; 0: any."""
-    min_advantage_std: float = 0.01  # a policy that has earned nothing yet follows noise
+    # A policy that has earned nothing yet follows noise.
+    min_advantage_std: float = 0.01
     """Least deviation that advantages are divided by [scaled reward]; 0: any, however small."""
-    noise_color: float = 0.75  # with white noise, three of five hanging poles never swung up
+    # With white noise, three of five hanging poles never swung up.
+    noise_color: float = 0.75
     """Exponent b of the action noise, of power 1 / f^b: 0 white, 1 pink, whose pushes last."""
     value_weight: float = 0.5
     """Weight of the value loss."""
     entropy_weight: float = 0.02
     """Weight of the entropy bonus, a mean over the actions where other trainers have a sum."""
-    entropy_target: float = 0.3  # beyond it, a bonus only holds a hopper down
+    # Beyond it, a bonus only holds a hopper down.
+    entropy_target: float = 0.3
     """Entropy up to which the bonus counts [nats for each action]; a uniform policy has 0.69."""
     max_gradient_norm: float = 1.0
     """Gradients are scaled down to this global norm."""
@@ -63,7 +68,12 @@ class Config:
 
     @classmethod
     def plain(cls, num_steps: int, **settings: Any) -> "Config":
-        """Returns PPO as other trainers have it: what they lack is off, unless in `settings`."""
+        """Returns PPO as other trainers have it: what they lack is off.
+
+        Args:
+          num_steps: control steps of the whole run.
+          settings: any other field by name; one that is given is not switched off.
+        """
         off: dict[str, Any] = {"shortest_episode": 0, "advantage_clip": 0.0, "noise_color": 0.0}
         off |= {"min_advantage_std": 0.0, "entropy_weight": 0.0, "entropy_target": 1.0}
         off |= {"schedule": "constant", "reward_scaling": "constant"}

@@ -5,6 +5,7 @@ stores raw actions. So a log-probability needs no inverse of tanh, and is exact 
 action range.
 """
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,14 +20,26 @@ _WEIGHTS = (_WEIGHTS / _WEIGHTS.sum()).astype(np.float32)
 
 
 def sample(parameters: Normal, noise: Array) -> Array:
-    """Returns the raw action [..., A] for standard normal `noise` [..., A]."""
+    """Returns the raw action, loc + scale * noise, [..., A].
+
+    Args:
+      parameters: [..., A] the Gaussian.
+      noise: [..., A] drawn from a standard normal.
+    """
+    chex.assert_equal_shape([*parameters, noise])
     return parameters.loc + parameters.scale * noise
 
 
 def given(parameters: Normal, noise: Normal | None) -> Normal:
-    """Returns the Gaussian of raw actions whose noise has the Gaussian `noise` [..., A]."""
+    """Returns the Gaussian of the raw action if its noise is not standard normal, [..., A].
+
+    Args:
+      parameters: [..., A] the policy's Gaussian.
+      noise: [..., A] the Gaussian that the noise is drawn from; None: the standard normal.
+    """
     if noise is None:
         return parameters
+    chex.assert_equal_shape([*parameters, *noise])
     return Normal(parameters.loc + parameters.scale * noise.loc, parameters.scale * noise.scale)
 
 
@@ -36,12 +49,20 @@ def to_action(raw: Array) -> Array:
 
 
 def log_prob(parameters: Normal, raw: Array) -> Array:
-    """Returns the log-density of action = tanh(raw), [...] (change of variables)."""
+    """Returns the log-density of action = tanh(raw), [...], by a change of variables.
+
+    Args:
+      parameters: [..., A] the Gaussian of the raw action.
+      raw: [..., A] the raw action.
+    """
     return normal_log_prob(parameters, raw) - log_tanh_derivative(raw).sum(axis=-1)
 
 
 def entropy(parameters: Normal) -> Array:
     """Returns H[tanh(X)] = H[X] + E[log tanh'(X)], [...] nats, by Gauss-Hermite quadrature."""
+    chex.assert_equal_shape([*parameters])
+    # E[f(X)] = sum_i w_i f(loc + scale * x_i). The nodes are constants, so a gradient passes, and
+    # two evaluations of one policy agree to the bit.
     loc, scale = parameters.loc[..., None], parameters.scale[..., None]
     raw = loc + scale * _NODES.reshape((1,) * parameters.loc.ndim + (-1,))
     correction = log_tanh_derivative(raw) @ _WEIGHTS
@@ -49,7 +70,15 @@ def entropy(parameters: Normal) -> Array:
 
 
 def normal_log_prob(parameters: Normal, raw: Array) -> Array:
-    """Returns log N(raw; loc, scale^2) summed over action features, [...]."""
+    """Returns log N(raw; loc, scale^2) summed over action features, [...].
+
+    Args:
+      parameters: [..., A] loc and scale.
+      raw: [..., A] where the density is wanted.
+    """
+    chex.assert_equal_shape([*parameters, raw])
+    chex.assert_type([*parameters, raw], float)
+    # A product over independent features is a sum of logarithms; [..., A] becomes [...].
     standardized = (raw - parameters.loc) / parameters.scale
     per_feature = -0.5 * (jnp.square(standardized) + np.log(2 * np.pi)) - jnp.log(parameters.scale)
     return per_feature.sum(axis=-1)

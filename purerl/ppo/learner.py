@@ -1,4 +1,9 @@
-"""The learner: E epochs of K minibatch steps on what an update has collected (PPO, section 5)."""
+"""The learner: E epochs of K minibatch steps on what an update has collected (PPO, section 5).
+
+What is shuffled are columns. Of a feed-forward network, a column is one sample: the rollout is laid
+out in one row, T' = 1. Of a recurrent one, it is the whole rollout of one environment, T' = T.
+Everything is computed by parts, [V, ...], as `core/parts.py` says.
+"""
 
 from typing import NamedTuple
 
@@ -6,19 +11,18 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from purerl.core.keys import Purpose, derive
+from purerl.core.keys import Purpose, derive, per_environment
 from purerl.core.parts import Parts
 from purerl.core.records import Array, Metrics, Network, PolicyOutput, PyTree, TrainState
-from purerl.ppo import distributions, losses
+from purerl.ppo import distributions, episodes, losses
 from purerl.ppo.batches import Batch, in_one_row
 from purerl.ppo.config import Config
 from purerl.ppo.optimizer import next_rate, optimizer, scheduled_rate
-from purerl.ppo.rollout import select
-from purerl.ppo.running_moments import Moments, moments, pool
+from purerl.ppo.running_moments import Moments, moments_of, pool
 
 
 class Learner(NamedTuple):
-    """What a minibatch step changes."""
+    """What a minibatch step changes; fields of `TrainState`, by their names there."""
 
     params: PyTree
     optimizer: PyTree  # Adam's moments of all parameters
@@ -26,9 +30,9 @@ class Learner(NamedTuple):
     skipped_in_a_row: Array  # [] int32
 
 
-def is_recurrent(carry: PyTree) -> bool:
-    """Tells whether a network with this carry remembers anything."""
-    return len(jax.tree.leaves(carry)) > 0
+def is_recurrent(memory: PyTree) -> bool:
+    """Tells whether a network with this memory remembers anything."""
+    return len(jax.tree.leaves(memory)) > 0
 
 
 def learn(
@@ -37,113 +41,160 @@ def learn(
     state: TrainState,
     batch: Batch,
     memory: PyTree,
-    first: Array,
+    part_ids: Array,
     parts: Parts,
 ) -> tuple[TrainState, Metrics]:
-    """Makes E epochs of K minibatch steps; does not read the environments in `state`.
+    """Makes E epochs of K minibatch steps.
 
-    Each part shuffles its own samples of a rollout, [V, T, B, ...], by the number of its `first`
-    environment [V], and has an equal share of every minibatch. `memory` [V, B, H] opens it.
+    Each part shuffles its own columns, and has an equal share of every minibatch.
+
+    Args:
+      config: the hyperparameters.
+      network: the policy and value function.
+      state: for what is learned, the key and the update; its environments are not read.
+      batch: [V, T, B, ...] a rollout.
+      memory: [V, B, H] the policy's at the rollout's start.
+      part_ids: [V] int32 the id of each part's first environment, for its shuffling.
+      parts: how the V parts are computed.
+
+    Returns:
+      `state` with what was learned, and metrics, name -> [].
     """
-    if not is_recurrent(memory):  # then what is shuffled are single samples, else whole rollouts
+    if not is_recurrent(memory):
         batch = jax.vmap(in_one_row)(batch)
-    columns = batch.weight.shape[-1]
+    num_columns = batch.weight.shape[-1]
     rate = scheduled_rate(config, state)
     learner = Learner(state.params, state.optimizer, rate, state.skipped_in_a_row)
     key = derive(state.key, Purpose.PERMUTATION, state.update)
 
     def step(learner: Learner, chosen: tuple[Array, Moments]) -> tuple[Learner, Metrics]:
-        index, scale = chosen
+        index, advantage_moments = chosen
         minibatch, start = jax.vmap(take_columns)(batch, memory, index)
-        return minibatch_step(config, network, learner, minibatch, start, scale, parts)
+        return minibatch_step(config, network, learner, minibatch, start, advantage_moments, parts)
 
-    def epoch(learner: Learner, number: Array) -> tuple[Learner, Metrics]:
-        epoch_key = jax.random.fold_in(key, number)
-        order = shuffle(epoch_key, first, columns, config.num_minibatches)
-        scales = advantage_scales(batch, order, parts)
+    def epoch(learner: Learner, epoch_id: Array) -> tuple[Learner, Metrics]:
+        epoch_key = jax.random.fold_in(key, epoch_id)
+        order = shuffle(epoch_key, part_ids, num_columns, config.num_minibatches)
+        # Advantages are constants of the whole update, so their moments in all K minibatches are
+        # known before the first step. Pooled here, they cost the parts one message for an epoch;
+        # inside the scan it would be one more for each step.
+        scales = minibatch_moments(batch, order, parts)
         return jax.lax.scan(step, learner, (jnp.swapaxes(order, 0, 1), scales))
 
     learner, metrics = jax.lax.scan(epoch, learner, jnp.arange(config.num_epochs))
-    metrics = average_sound(metrics)
-    metrics |= {
+    metrics = average_sound(metrics) | {
         "skipped_in_a_row": learner.skipped_in_a_row.astype(jnp.float32),
         "learning_rate": learner.learning_rate,
         "parameter_norm": optax.tree.norm(learner.params),
-        "explained_variance": losses.explained_variance(
-            batch.old_value, batch.target, batch.weight, parts
-        ),
     }
-    return state.replace(**learner._asdict()), metrics
+    known = batch.old_value, batch.target, batch.weight
+    metrics["explained_variance"] = losses.explained_variance(*known, parts)
+    state = state.replace(params=learner.params, optimizer=learner.optimizer)
+    rate, in_a_row = learner.learning_rate, learner.skipped_in_a_row
+    return state.replace(learning_rate=rate, skipped_in_a_row=in_a_row), metrics
 
 
 def take_columns(batch: Batch, memory: PyTree, index: Array) -> tuple[Batch, PyTree]:
-    """Returns the columns `index` [M] of one part's batch [T', ...], and their memory."""
+    """Returns some columns of one part's batch, [T', M, ...], and their memory, [M, H].
+
+    Args:
+      batch: [T', C, ...] of one part, of C columns.
+      memory: [B, H] at the rollout's start; of a feed-forward network, ().
+      index: [M] int32 which columns.
+    """
+    # Where there is a memory, columns are environments, so one index serves both.
     minibatch = jax.tree.map(lambda x: jnp.take(x, index, axis=1), batch)
     return minibatch, jax.tree.map(lambda x: jnp.take(x, index, axis=0), memory)
 
 
-def shuffle(key: Array, first: Array, columns: int, minibatches: int) -> Array:
-    """Returns which of its columns each of V parts gives to each minibatch, [V, K, M]."""
+def shuffle(key: Array, part_ids: Array, num_columns: int, num_minibatches: int) -> Array:
+    """Returns which of its columns each of V parts gives to each minibatch, [V, K, M].
 
-    def alone(number: Array) -> Array:
-        order = jax.random.permutation(jax.random.fold_in(key, number), columns)
-        return order.reshape(minibatches, -1)
+    Args:
+      key: [] typed, of the epoch.
+      part_ids: [V] int32. A part's order depends on its own id alone, so it is the same wherever
+        the part is computed.
+      num_columns: columns of one part, a multiple of K.
+      num_minibatches: K.
+    """
+    keys = per_environment(key, part_ids)
+    order = jax.vmap(lambda key: jax.random.permutation(key, num_columns))(keys)
+    return order.reshape(len(part_ids), num_minibatches, -1)
 
-    return jax.vmap(alone)(first)
 
+def minibatch_moments(batch: Batch, order: Array, parts: Parts) -> Moments:
+    """Returns the moments of the advantages in all K minibatches of an epoch, [K].
 
-def advantage_scales(batch: Batch, order: Array, parts: Parts) -> Moments:
-    """Returns the moments of the advantages in all K minibatches of an epoch, [K]."""
+    Args:
+      batch: [V, T', C, ...] of C columns in each part.
+      order: [V, K, M] which columns are in which minibatch.
+      parts: how the V parts are computed.
+    """
 
     def of_each(advantage: Array, weight: Array, order: Array) -> Moments:
         advantage, weight = (jnp.take(x, order, axis=1) for x in (advantage, weight))
-        return jax.vmap(moments, in_axes=1)(advantage, weight > 0)  # of [T', K, M]
+        return jax.vmap(moments_of, in_axes=1)(advantage, weight > 0)  # of [T', K, M]
 
     found = parts.map(of_each, batch.advantage, batch.weight, order)
     return pool(parts.gather(found))
 
 
 def average_sound(metrics: Metrics) -> Metrics:
-    """Averages metrics over the minibatches, [E, K] -> [], without those that were skipped.
-
-    The figures of a skipped minibatch are not finite; they must not hide the others'.
-    """
-    skipped = metrics.pop("skipped")
+    """Averages metrics over the minibatches, [E, K] -> [], without those that were skipped."""
+    skipped = metrics["skipped"]
     sound = jnp.maximum((1.0 - skipped).sum(), 1.0)
-    means = {k: jnp.where(skipped > 0, 0.0, x).sum() / sound for k, x in metrics.items()}
+    # `where`, not a product, for the figures of a skipped minibatch are NaN or infinite.
+    others = {k: x for k, x in metrics.items() if k != "skipped"}
+    means = {k: jnp.where(skipped > 0, 0.0, x).sum() / sound for k, x in others.items()}
     return means | {"skipped_minibatches": skipped.sum()}
 
 
 def unroll(network: Network, params: PyTree, batch: Batch, memory: PyTree) -> PolicyOutput:
-    """Applies the network to a minibatch [T', M', ...], its memory restarted with each episode."""
+    """Applies the network to one part of a minibatch, its memory restarted with each episode.
+
+    Args:
+      network: the policy and value function.
+      params: its parameters, unbatched.
+      batch: [T', M, ...].
+      memory: [M, H] at the rollout's start, which the policy of that time had computed.
+
+    Returns:
+      Gaussians and values, [T', M, ...].
+    """
     if not is_recurrent(memory):
         output, _ = network.apply(params, batch.observation, memory)
         return output
 
+    # Backpropagation through time reaches back to the rollout's first step and stops there: the
+    # memory at that step is data, and of older parameters.
     def step(memory: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, PolicyOutput]:
-        observation, first = row
-        fresh = select(first, jax.tree.map(jnp.zeros_like, memory), memory)
+        observation, is_first = row
+        fresh = episodes.select(is_first, jax.tree.map(jnp.zeros_like, memory), memory)
         output, memory = network.apply(params, observation, fresh)
         return memory, output
 
-    _, outputs = jax.lax.scan(step, memory, (batch.observation, batch.first))
+    _, outputs = jax.lax.scan(step, memory, (batch.observation, batch.is_first))
     return outputs
 
 
 def loss(
-    config: Config, network: Network, params: PyTree, scale: Moments, batch: Batch, memory: PyTree
+    config: Config, output: PolicyOutput, advantage_moments: Moments, batch: Batch
 ) -> tuple[Array, Metrics]:
     """Returns policy loss + value_weight * value loss - entropy_weight * bonus, [], and metrics.
 
-    Of one part of a minibatch whose advantages have the moments `scale`. Their sum over all parts
-    is the minibatch's loss.
+    Each is one part's share: the sum over all parts is the minibatch's.
+
+    Args:
+      config: the hyperparameters.
+      output: [T', M, ...] what the network says now of the batch's observations.
+      advantage_moments: of the whole minibatch, all parts together, [] each.
+      batch: [T', M, ...] one part of the minibatch.
     """
-    output = unroll(network, params, batch, memory)
     distribution = distributions.given(output.distribution, batch.noise)
     log_prob = distributions.log_prob(distribution, batch.raw_action)
-    log_ratio = log_prob - batch.log_prob
+    log_ratio = log_prob - batch.log_prob  # 0 in the first step: the statistics have not moved
     least, clip = config.min_advantage_std, config.advantage_clip
-    advantage = losses.normalize_advantage(batch.advantage, scale, least, clip)
+    advantage = losses.normalize_advantage(batch.advantage, advantage_moments, least, clip)
     terms = {
         "policy_loss": losses.clipped_surrogate(log_ratio, advantage, config.clip),
         "value_loss": losses.value_loss(output.value, batch.target),
@@ -151,14 +202,15 @@ def loss(
         "kl": losses.approximate_kl(log_ratio),
         "clip_fraction": (jnp.abs(jnp.expm1(log_ratio)) > config.clip).astype(jnp.float32),
     }
-    number = jnp.maximum(scale.number.astype(jnp.float32), 1.0)
-    means = {k: (batch.weight * term).sum() / number for k, term in terms.items()}
+    # Over all parts' samples, not this one's: so shares of a mean add up to the mean.
+    count = jnp.maximum(advantage_moments.num_samples.astype(jnp.float32), 1.0)
+    means = {k: (batch.weight * term).sum() / count for k, term in terms.items()}
     size = batch.raw_action.shape[-1]
     bonus = losses.bounded_entropy(terms["entropy"], size, config.entropy_target)
     objective = (
         means["policy_loss"]
         + config.value_weight * means["value_loss"]
-        - config.entropy_weight * (batch.weight * bonus).sum() / number
+        - config.entropy_weight * (batch.weight * bonus).sum() / count
     )
     return objective, means
 
@@ -169,33 +221,45 @@ def minibatch_step(
     learner: Learner,
     batch: Batch,
     memory: PyTree,
-    scale: Moments,
+    advantage_moments: Moments,
     parts: Parts,
 ) -> tuple[Learner, Metrics]:
     """Makes one gradient step; a step with a number that is not finite is skipped and counted.
 
-    The minibatch is [V, T', M, ...], its memory [V, M, H]. `scale` is of its advantages.
+    Args:
+      config: the hyperparameters.
+      network: the policy and value function.
+      learner: before the step, unbatched.
+      batch: [V, T', M, ...] the minibatch.
+      memory: [V, M, H] at the rollout's start.
+      advantage_moments: of the minibatch's advantages, [] each.
+      parts: how the V parts are computed.
+
+    Returns:
+      The learner after the step, and metrics, name -> [].
     """
 
     def gradient(batch: Batch, memory: PyTree) -> tuple[tuple[Array, Metrics], PyTree]:
         def objective(params: PyTree) -> tuple[Array, Metrics]:
-            return loss(config, network, params, scale, batch, memory)
+            output = unroll(network, params, batch, memory)
+            return loss(config, output, advantage_moments, batch)
 
         return jax.value_and_grad(objective, has_aux=True)(learner.params)
 
+    # The gradient of a sum is the sum of gradients, so parts meet here and nowhere else in a step.
     (objective, metrics), gradients = parts.sum(gradient, batch, memory)
+    # One number that is not finite makes the norm so. The loss may be NaN though no gradient is.
     norm = optax.tree.norm(gradients)
     sound = jnp.isfinite(objective) & jnp.isfinite(norm)
+    # Made in any case, and dropped below if it is not sound. On a GPU a branch makes the host wait.
     updates, optimizer_state = optimizer(config).update(gradients, learner.optimizer)
-    stepped = jax.tree.map(
-        lambda x, u: x - (learner.learning_rate * u).astype(x.dtype), learner.params, updates
-    )
-    params, optimizer_state = jax.tree.map(
-        lambda new, old: jnp.where(sound, new, old),
-        (stepped, optimizer_state),
-        (learner.params, learner.optimizer),
-    )
-    rate = next_rate(config, learner.learning_rate, metrics["kl"], sound)
+    # The rate is float32; parameters may have half of its precision, and keep their dtype.
+    rate = learner.learning_rate
+    stepped = jax.tree.map(lambda x, u: x - (rate * u).astype(x.dtype), learner.params, updates)
+    new, old = (stepped, optimizer_state), (learner.params, learner.optimizer)
+    params, optimizer_state = jax.tree.map(lambda x, y: jnp.where(sound, x, y), new, old)
+    rate = next_rate(config, rate, metrics["kl"], sound)
+    # Whoever runs the loop may stop a run that does nothing but skip.
     in_a_row = jnp.where(sound, 0, learner.skipped_in_a_row + 1)
     learner = Learner(params, optimizer_state, rate, in_a_row)
     skipped = 1.0 - sound.astype(jnp.float32)

@@ -25,7 +25,8 @@ class PolicyOptions:
     """Policy scale: one learned vector, or a function of the observation."""
     initial_std: float = 1.0
     """Policy scale before training, above `min_std`, in raw-action units."""
-    min_std: float = 0.2  # a standing cart-pole's was 0.04, steps became leaps, and it fell
+    # A standing cart-pole's was 0.04. Steps became leaps, and it fell.
+    min_std: float = 0.2
     """Least policy scale, to which what is learned is added."""
 
     def __post_init__(self) -> None:
@@ -76,7 +77,7 @@ def value_features(observation: PyTree) -> Array:
 
 
 class Stack(nn.Module):
-    """Dense layers with an activation after each."""
+    """Dense layers with an activation after each; [..., O] to [..., last width]."""
 
     widths: tuple[int, ...]
     activation: str
@@ -98,13 +99,14 @@ class GaussianHead(nn.Module):
     @nn.compact
     def __call__(self, x: Array) -> Normal:
         """Returns the Gaussian of features [..., H]."""
-        # Nearly zero weights: the first policy explores alike everywhere.
+        # Nearly zero weights: the first policy is the same everywhere, so it explores everywhere.
         small = nn.initializers.variance_scaling(1e-4, "fan_in", "truncated_normal")
         loc = nn.Dense(self.action_size, kernel_init=small, name="loc")(x)
         if self.options.std == "state":
             raw = nn.Dense(self.action_size, kernel_init=small, name="scale")(x)
         else:
             raw = self.param("scale", nn.initializers.zeros, (self.action_size,))
+        # The parameter starts at 0, and the scale at `initial_std` above its least.
         inverse_softplus = math.log(math.expm1(self.options.initial_std))
         scale = jax.nn.softplus(raw + inverse_softplus) + self.options.min_std
         return Normal(loc=loc, scale=jnp.broadcast_to(scale, loc.shape))
@@ -123,6 +125,7 @@ class MlpActorCritic(nn.Module):
         policy = Stack(o.policy_hidden, o.activation, name="policy")(policy_features(observation))
         normal = GaussianHead(o, self.action_size, name="head")(policy)
         value = Stack(o.value_hidden, o.activation, name="value")(value_features(observation))
+        # A value that kept its axis, [B, 1], would broadcast against rewards [B] to [B, B].
         return PolicyOutput(normal, nn.Dense(1, name="value_out")(value)[..., 0])
 
 
@@ -133,53 +136,72 @@ class RecurrentActorCritic(nn.Module):
     action_size: int
 
     @nn.compact
-    def __call__(self, observation: PyTree, carry: PyTree) -> tuple[PolicyOutput, PyTree]:
-        """Moves the memory [..., H] on by one observation, and answers from it."""
+    def __call__(self, observation: PyTree, memory: PyTree) -> tuple[PolicyOutput, PyTree]:
+        """Moves the memory on by one observation, and answers from it.
+
+        Args:
+          observation: leaves [..., O].
+          memory: leaves [..., H]; an LSTM has two.
+        """
         o = self.options
         encoded = Stack(o.encoder, o.activation, name="encoder")(policy_features(observation))
         cell = {"gru": nn.GRUCell, "lstm": nn.OptimizedLSTMCell}[o.cell](o.hidden, name="cell")
-        carry, memory = cell(carry, encoded)
-        normal = GaussianHead(o, self.action_size, name="head")(memory)
-        features = jnp.concatenate([memory, value_features(observation)], axis=-1)
+        memory, remembered = cell(memory, encoded)
+        normal = GaussianHead(o, self.action_size, name="head")(remembered)
+        # The value function sees what the policy may not, such as the state of the simulation.
+        features = jnp.concatenate([remembered, value_features(observation)], axis=-1)
         value = Stack(o.value_hidden, o.activation, name="value")(features)
-        return PolicyOutput(normal, nn.Dense(1, name="value_out")(value)[..., 0]), carry
+        return PolicyOutput(normal, nn.Dense(1, name="value_out")(value)[..., 0]), memory
 
 
-def from_linen(module: nn.Module, observation: PyTree, carry: PyTree = ()) -> Network:
+def from_linen(module: nn.Module, observation: PyTree, memory: PyTree = ()) -> Network:
     """Adapts a Flax module to `Network`.
 
     Args:
-      module: `module(observation) -> PolicyOutput`, or, with a carry,
-        `module(observation, carry) -> (PolicyOutput, carry)`. Leading axes are batch axes.
-      observation: an example of one observation, leaves [O] (shapes only matter).
-      carry: one environment's memory at the start of an episode, leaves [H], all zeros.
+      module: `module(observation) -> PolicyOutput`, or, with a memory,
+        `module(observation, memory) -> (PolicyOutput, memory)`. Leading axes are batch axes.
+      observation: an example of one observation, leaves [O], unbatched (shapes only matter).
+      memory: one environment's memory at the start of an episode, leaves [H], all zeros.
     """
-    recurrent = len(jax.tree.leaves(carry)) > 0
-    if any(jnp.any(x != 0) for x in jax.tree.leaves(carry)):
-        raise ValueError("A memory starts an episode at zero; this carry has other numbers in it.")
-    arguments = (observation, carry) if recurrent else (observation,)
+    # A module without a memory takes one argument and returns one thing, which is what most have.
+    recurrent = len(jax.tree.leaves(memory)) > 0
+    if any(jnp.any(x != 0) for x in jax.tree.leaves(memory)):
+        raise ValueError("A memory starts an episode at zero; this one has other numbers in it.")
+    arguments = (observation, memory) if recurrent else (observation,)
 
     def init(key: Array) -> tuple[PyTree, PyTree]:
-        return module.init(key, *arguments), carry
+        return module.init(key, *arguments), memory
 
-    def apply(params: PyTree, observation: PyTree, carry: PyTree) -> tuple[PolicyOutput, PyTree]:
+    def apply(params: PyTree, observation: PyTree, memory: PyTree) -> tuple[PolicyOutput, PyTree]:
         if recurrent:
-            return module.apply(params, observation, carry)
+            return module.apply(params, observation, memory)
         output: Any = module.apply(params, observation)
-        return output, carry
+        return output, memory
 
     return Network(init=init, apply=apply)
 
 
 def mlp(options: MlpOptions, observation: PyTree, action_size: int) -> Network:
-    """Builds the default network for one `observation` (leaves [O]) and `action_size` A."""
+    """Builds the default network.
+
+    Args:
+      options: its sizes.
+      observation: an example of one observation, unbatched: [O], or a flat dict of such.
+      action_size: A.
+    """
     check_observation(observation)
     return from_linen(MlpActorCritic(options, action_size), observation)
 
 
 def recurrent(options: RecurrentOptions, observation: PyTree, action_size: int) -> Network:
-    """Builds the GRU or LSTM network for one `observation` (leaves [O]) and `action_size` A."""
+    """Builds the GRU or LSTM network.
+
+    Args:
+      options: its sizes.
+      observation: an example of one observation, unbatched: [O], or a flat dict of such.
+      action_size: A.
+    """
     check_observation(observation)
-    memory = jnp.zeros(options.hidden)
-    carry = memory if options.cell == "gru" else (memory, memory)
-    return from_linen(RecurrentActorCritic(options, action_size), observation, carry)
+    zeros = jnp.zeros(options.hidden)
+    memory = zeros if options.cell == "gru" else (zeros, zeros)
+    return from_linen(RecurrentActorCritic(options, action_size), observation, memory)

@@ -1,4 +1,10 @@
-"""Adam, and a learning rate that is constant, linear or steered by the policy's KL."""
+"""Adam, and a learning rate that is constant, linear or steered by the policy's KL.
+
+Optax usually multiplies by the learning rate itself, as the last link of its chain. Here the
+learner does. The rate is a number of `TrainState`: the policy's KL moves it after each minibatch,
+and a resumed run may set another. Inside optax it would be part of the optimizer's state, and a
+change of schedule would change what a checkpoint holds.
+"""
 
 import jax.numpy as jnp
 import optax
@@ -8,16 +14,24 @@ from purerl.ppo.config import Config
 
 
 def optimizer(config: Config) -> optax.GradientTransformation:
-    """Clips by global norm, then Adam's direction; the caller multiplies by the learning rate."""
+    """Clips by global norm, then Adam's direction; the caller multiplies by minus the rate."""
+    # Adam divides by the gradient's own size plus eps. With optax's eps of 1e-8, a gradient that is
+    # mere rounding would make a whole step; OpenAI's PPO has 1e-5, too.
     return optax.chain(
         optax.clip_by_global_norm(config.max_gradient_norm), optax.scale_by_adam(eps=1e-5)
     )
 
 
 def scheduled_rate(config: Config, state: TrainState) -> Array:
-    """Returns the learning rate that this update starts with, []; a resumed run may set another."""
+    """Returns the learning rate that an update starts with, [].
+
+    Args:
+      config: the schedule. A resumed run may set another rate, and it counts at once.
+      state: for the update's number, and for the rate that the adaptive schedule left.
+    """
     if config.schedule == "adaptive_kl":
         return state.learning_rate
+    # 1 at the first update and 1 / num_updates at the last: no update is made with a rate of 0.
     left = 1.0 - state.update.astype(jnp.float32) / config.num_updates
     return jnp.float32(config.learning_rate) * (left if config.schedule == "linear" else 1.0)
 
@@ -27,6 +41,12 @@ def next_rate(config: Config, rate: Array, kl: Array, sound: Array) -> Array:
 
     The adaptive schedule of Schulman et al. 2017 (section 4), applied to the learning rate: a
     factor 1.5 down above twice the desired KL, up below half of it, within [1e-5, 1e-2].
+
+    Args:
+      config: the schedule.
+      rate: [] of the minibatch step before.
+      kl: [] estimated KL(old, new) in the minibatch.
+      sound: [] bool: the step was made. The KL of a skipped one may be NaN, and moves nothing.
     """
     if config.schedule != "adaptive_kl":
         return rate

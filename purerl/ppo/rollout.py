@@ -7,21 +7,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from purerl.core.env import ABSURD, Env, State
+from purerl.core.env import Env, State
 from purerl.core.keys import Purpose, derive, per_environment
-from purerl.core.records import (
-    Array,
-    EpisodeStats,
-    Metrics,
-    Network,
-    Normal,
-    PolicyOutput,
-    PyTree,
-    TrainState,
-)
-from purerl.ppo import distributions, running_moments
+from purerl.core.records import Array, EpisodeStats, Metrics, Network, Normal, PyTree, TrainState
+from purerl.ppo import distributions, episodes
 from purerl.ppo.config import Config
 from purerl.ppo.noise import action_noise
 
@@ -31,8 +21,10 @@ class Transition(NamedTuple):
 
     observation: PyTree  # [..., O] before the step
     raw_action: Array  # [..., A] before squashing
-    noise: Normal | None  # [..., A] its noise given that before; None: white
-    log_prob: Array  # [...] of the raw action, under the policy that acted and such noise
+    # The Gaussian of the action's noise, given the noise of the steps before it; None: white noise,
+    # whose Gaussian is the standard one.
+    noise: Normal | None  # [..., A]
+    log_prob: Array  # [...] of the raw action, under the policy that acted, with that noise
     value: Array  # [...] V(s_t)
     reward: Array  # [...] unscaled
     discounted_return: Array  # [...] running, for reward scaling
@@ -43,116 +35,36 @@ class Transition(NamedTuple):
     valid: Array  # [...] bool: False where the physics blew up
 
 
-class Carry(NamedTuple):
-    """What the scan over time carries, [B, ...]."""
+class RolloutState(NamedTuple):
+    """What the scan over time hands from step to step, [B, ...]."""
 
-    env: State
-    memory: PyTree
+    env_state: State
+    memory: PyTree  # [B, H] the policy's, before it sees this state
     episode: EpisodeStats
-    discounted_return: Array
+    discounted_return: Array  # [B]
     sums: Metrics  # name -> [B] over the episodes that ended, and how many "resets" there were
 
 
-def select(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
-    """Returns `yes` where `condition` ([B] bool), else `no`, for every leaf [B, ...]."""
-
-    def one(a: Array, b: Array) -> Array:
-        return jnp.where(jnp.expand_dims(condition, tuple(range(1, b.ndim))), a, b)
-
-    return jax.tree.map(one, yes, no)
-
-
-def is_lost(state: State) -> Array:
-    """Tells, for one environment, whether any number of its state is NaN or absurd, [] bool."""
-    parts = (state.physics, state.observation, state.reward, state.metrics, state.task)
-    leaves = [x for x in jax.tree.leaves(parts) if jnp.issubdtype(x.dtype, jnp.floating)]
-    sound = [jnp.all(jnp.abs(x) <= ABSURD) for x in leaves]  # a NaN fails every comparison
-    return ~jnp.all(jnp.stack(sound))
-
-
-def act(
-    network: Network, state: TrainState, env: State, memory: PyTree
-) -> tuple[PolicyOutput, PyTree]:
-    """Applies the network of `state` to the normalized observations of environments [B]."""
-    observation = running_moments.normalize(state.normalizer, env.observation)
-    return network.apply(state.params, observation, memory)
-
-
-def episode_metrics(episode: EpisodeStats) -> Metrics:
-    """Returns episodes' metrics [B]: the mean over their steps, or the sum for `*_count`."""
-    length = jnp.maximum(episode.length, 1).astype(jnp.float32)
-    return {k: x if k.endswith("_count") else x / length for k, x in episode.metrics.items()}
-
-
-def start_memory(carry: PyTree, number: int) -> PyTree:
-    """Returns the memory of `number` episodes about to start, like a `carry` [B, ...]: zeros."""
-    return jax.tree.map(lambda x: jnp.zeros((number, *x.shape[1:]), x.dtype), carry)
-
-
-def time_limits(config: Config, number: Array) -> Array:
-    """Returns the time limits of training episodes, [B] int32, of environments `number` [B].
-
-    Short episodes practise the start; a policy that never saw a long one drifts out of what it
-    knows. So every environment keeps a limit of its own, from short to whole.
-    """
-    if not 0 < config.shortest_episode < config.episode_length:
-        return jnp.full(number.shape, config.episode_length, jnp.int32)
-    spaced = np.geomspace(config.shortest_episode, config.episode_length, config.num_envs)
-    return jnp.asarray(np.round(spaced), jnp.int32)[number]
-
-
-def start_episodes(state: State, limit: Array) -> EpisodeStats:
-    """Returns the statistics of episodes about to start in `state` [B] with time limits [B]."""
-    zeros = jnp.zeros(limit.shape)
-    return EpisodeStats(
-        episode_return=zeros,
-        length=jnp.zeros(limit.shape, jnp.int32),
-        limit=limit,
-        metrics={name: zeros for name in state.metrics},
-    )
-
-
-def step_episodes(
-    env: Env, state: State, episode: EpisodeStats, action: Array
-) -> tuple[State, EpisodeStats]:
-    """Steps environments [B] once, adds the step to their episodes, applies the time limit."""
-    state = jax.vmap(env.step)(state, action)
-    length = episode.length + 1
-    truncated = (state.truncated | (length >= episode.limit)) & ~state.terminated
-    episode = episode.replace(
-        episode_return=episode.episode_return + state.reward,
-        length=length,
-        metrics={k: total + state.metrics[k] for k, total in episode.metrics.items()},
-    )
-    return state.replace(truncated=truncated), episode
-
-
 def truncation_values(
-    network: Network, state: TrainState, env: State, memory: PyTree, truncated: Array
+    network: Network, state: TrainState, env_state: State, memory: PyTree, truncated: Array
 ) -> Array:
-    """Returns V(s'_t) where `truncated` [B], else 0.
+    """Returns V(s'_t) where an episode was truncated, else 0, [B].
 
-    Computed here, from the observation before the reset and the memory that goes with it, and
-    only in steps where some environment was truncated: no next observation is ever stored.
+    Args:
+      network: the policy and value function.
+      state: for the parameters and the statistics of observations.
+      env_state: [B, ...] after the step, before any reset.
+      memory: [B, H] after the step.
+      truncated: [B] bool.
     """
 
     def values() -> Array:
-        output, _ = act(network, state, env, memory)
+        output, _ = episodes.act(network, state, env_state, memory)
         return jnp.where(truncated, output.value, 0.0)  # drops those of lost environments, too
 
+    # From the observation before the reset, which no batch ever holds; and only in steps where some
+    # environment was truncated.
     return jax.lax.cond(truncated.any(), values, lambda: jnp.zeros(truncated.shape))
-
-
-def episode_sums(episode: EpisodeStats, over: Array, lost: Array) -> Metrics:
-    """Returns what each environment [B] adds to the sums of a rollout in one step.
-
-    Its episode may be `over` [B], `lost` [B] if because its state is not finite, or absurd.
-    """
-    metrics = {f"episode/{name}": x for name, x in episode_metrics(episode).items()}
-    ended = {"episodes": jnp.ones(over.shape), "episode_return": episode.episode_return}
-    ended |= {"episode_length": episode.length.astype(jnp.float32)} | metrics
-    sound = {name: jnp.where(over & ~lost, x, 0.0) for name, x in ended.items()}
-    return sound | {"nonfinite_resets": lost.astype(jnp.float32), "resets": over.astype(jnp.int32)}
 
 
 def rollout(
@@ -160,26 +72,36 @@ def rollout(
 ) -> tuple[TrainState, Transition, Metrics, Array]:
     """Acts for T steps in the environments of `state`.
 
+    Args:
+      config: the hyperparameters.
+      env: the environment, unbatched.
+      network: the policy and value function.
+      state: of B environments, all of them or some.
+
     Returns:
       `state` with environments, memory and running episodes moved on; the transitions [T, B, ...];
       sums over the episodes that ended, name -> [B]; the value of the last observation [B].
     """
+    # One fresh start for each environment and update, made before the loop. Inside it, `vmap` would
+    # compute a reset in every step, whether an episode ended or not. An environment whose episodes
+    # end twice in an update begins again as it did before; `replayed_resets` counts that.
     reset_keys = per_environment(derive(state.key, Purpose.RESET, state.update), state.number)
-    # One start for an update, its number 0; without the fold all digests would be others.
+    # The fold with 0 does nothing that is needed. It goes at the next change of bits.
     fresh = jax.vmap(lambda key: env.reset(jax.random.fold_in(key, 0)))(reset_keys)
     noise = action_noise(config, state, env.action_size)
 
-    def step(carry: Carry, t: Array) -> tuple[Carry, Transition]:
-        return _step(config, env, network, state, fresh, carry, *noise(t))
+    def step(now: RolloutState, t: Array) -> tuple[RolloutState, Transition]:
+        white, conditional = noise(t)
+        return _step(config, env, network, state, fresh, now, white, conditional)
 
     never = jnp.zeros(state.number.shape, bool)
-    nothing = episode_sums(state.episode, never, never)
-    start = Carry(state.env, state.carry, state.episode, state.discounted_return, nothing)
+    nothing = episodes.episode_sums(state.episode, never, never)
+    start = RolloutState(state.env, state.carry, state.episode, state.discounted_return, nothing)
+    # Parameters and statistics are those of `state` in every step: only `RolloutState` moves.
     end, transitions = jax.lax.scan(step, start, jnp.arange(config.rollout_length))
-    output, _ = act(network, state, end.env, end.memory)
-    state = state.replace(
-        env=end.env, carry=end.memory, episode=end.episode, discounted_return=end.discounted_return
-    )
+    output, _ = episodes.act(network, state, end.env_state, end.memory)
+    state = state.replace(env=end.env_state, carry=end.memory, episode=end.episode)
+    state = state.replace(discounted_return=end.discounted_return)
     return state, transitions, end.sums, output.value
 
 
@@ -189,27 +111,40 @@ def _step(
     network: Network,
     state: TrainState,
     fresh: State,
-    carry: Carry,
+    now: RolloutState,
     white: Array,
     noise: Normal | None,
-) -> tuple[Carry, Transition]:
-    """Acts once in every environment, with noise of `white` [B, A]; `fresh` replaces what ended."""
-    output, memory = act(network, state, carry.env, carry.memory)
+) -> tuple[RolloutState, Transition]:
+    """Acts once in every environment, and starts anew those whose episode has ended.
+
+    Args:
+      config: the hyperparameters.
+      env: the environment, unbatched.
+      network: the policy and value function.
+      state: for the parameters and the statistics of observations, as they were before the rollout.
+      fresh: [B, ...] replaces the states of episodes that end.
+      now: [B, ...] before the step.
+      white: [B, A] standard normal noise.
+      noise: [B, A] the Gaussian that the action's noise has, as `Transition` has it.
+    """
+    output, memory = episodes.act(network, state, now.env_state, now.memory)
     distribution = distributions.given(output.distribution, noise)
     raw = distributions.sample(distribution, white)
     action = distributions.to_action(raw)
-    env_state, episode = step_episodes(env, carry.env, carry.episode, action)
+    env_state, episode = episodes.step_episodes(env, now.env_state, now.episode, action)
 
-    lost = jax.vmap(is_lost)(env_state)
+    # What a lost state says of itself cannot be trusted, so it neither terminates nor truncates.
+    lost = jax.vmap(episodes.is_lost)(env_state)
     terminated = env_state.terminated & ~lost
     truncated = env_state.truncated & ~lost
-    over = terminated | truncated | lost
+    done = terminated | truncated | lost
     reward = jnp.where(lost, 0.0, env_state.reward)
-    discounted_return = config.gamma * carry.discounted_return + reward
-    # A fresh start may itself be NaN, and 0 times NaN is no 0. A value that is a number stays:
+    discounted_return = config.gamma * now.discounted_return + reward
+    # No row of the batch may hold a NaN, not even one of weight 0, since 0 times NaN is NaN. The
+    # observation before a lost step is one if a fresh start was. A value that is a number stays:
     # the step before bootstraps from it.
-    seen = carry.env.observation, raw, distributions.log_prob(distribution, raw)
-    observation, raw, log_prob = select(lost, jax.tree.map(jnp.zeros_like, seen), seen)
+    seen = now.env_state.observation, raw, distributions.log_prob(distribution, raw)
+    observation, raw, log_prob = episodes.select(lost, jax.tree.map(jnp.zeros_like, seen), seen)
     transition = Transition(
         observation=observation,
         raw_action=raw,
@@ -219,16 +154,21 @@ def _step(
         reward=reward,
         discounted_return=discounted_return,
         terminated=terminated,
-        done=over,
+        done=done,
         truncated=truncated,
         truncation_value=truncation_values(network, state, env_state, memory, truncated),
         valid=~lost,
     )
-    following = Carry(
-        env=select(over, fresh, env_state),
-        memory=jax.tree.map(lambda x: select(over, jnp.zeros_like(x), x), memory),
-        episode=select(over, start_episodes(fresh, time_limits(config, state.number)), episode),
-        discounted_return=jnp.where(over, 0.0, discounted_return),
-        sums=jax.tree.map(jnp.add, carry.sums, episode_sums(episode, over, lost)),
+    # Everything above is of the episode that the step belongs to; from here on, of the next one.
+    following = RolloutState(
+        env_state=episodes.select(done, fresh, env_state),
+        memory=jax.tree.map(lambda x: episodes.select(done, jnp.zeros_like(x), x), memory),
+        episode=episodes.select(
+            done,
+            episodes.start_episodes(fresh, episodes.time_limits(config, state.number)),
+            episode,
+        ),
+        discounted_return=jnp.where(done, 0.0, discounted_return),
+        sums=jax.tree.map(jnp.add, now.sums, episodes.episode_sums(episode, done, lost)),
     )
     return following, transition

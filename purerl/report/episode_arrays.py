@@ -12,8 +12,8 @@ from purerl.core.records import Array, TrainState
 from purerl.experiment.objects import Setup
 from purerl.machine.state_arrays import Leaves, flatten
 from purerl.ppo import distributions
+from purerl.ppo.episodes import act
 from purerl.ppo.evaluation import Progress, advance, start
-from purerl.ppo.rollout import act
 
 
 def note_modules(noted: dict[str, Array]) -> Callable[..., Any]:
@@ -56,21 +56,22 @@ def play(
     def step(now: Progress, _: None) -> tuple[Progress, dict[str, Any]]:
         noted: dict[str, Array] = {}
         with nn.intercept_methods(note_modules(noted)):
-            output, memory = act(network, state, now.env, now.memory)
+            output, memory = act(network, state, now.env_state, now.memory)
         action = distributions.to_action(output.distribution.loc)
         following = advance(env, now, action, memory)
         return following, {
             "running": ~(now.over | following.lost),
-            "state": now.env,
+            "state": now.env_state,
             "action": action,
-            "reward": following.env.reward,
-            "terminated": following.env.terminated,
+            "reward": following.env_state.reward,
+            "terminated": following.env_state.terminated,
             "value": output.value,
             "memory": now.memory,
             "network": noted,
         }
 
-    return jax.lax.scan(step, start(config, env, state, reset_key, number), length=steps)
+    begun = start(env, state, reset_key, number, config.episode_length)
+    return jax.lax.scan(step, begun, length=steps)
 
 
 def record(setup: Setup, state: TrainState, seed: int, number: int) -> Leaves:

@@ -28,7 +28,7 @@ class Recording(NamedTuple):
 def record(setup: Setup, state: TrainState, key: Array, number: int, steps: int) -> Recording:
     """Plays episodes and keeps how every state looked; pure. Arguments: see `play`."""
     end, rows = play(setup, state, key, number, steps)
-    states = jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), rows["state"], end.env)
+    states = jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), rows["state"], end.env_state)
     pictures = jax.vmap(jax.vmap(functools.partial(take_picture, setup.env)))(states)
     # A lost state is not drawn: it has numbers that no camera can point at.
     shown = jnp.concatenate([jnp.ones((1, number), bool), rows["running"]])

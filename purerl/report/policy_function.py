@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from purerl.core.records import Array, PyTree
 from purerl.ppo import distributions, running_moments
-from purerl.ppo.rollout import start_memory
+from purerl.ppo.episodes import start_memory
 from purerl.report.flat_program import flat_program
 from purerl.runs.loaded_run import Run
 

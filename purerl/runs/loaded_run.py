@@ -174,7 +174,8 @@ class Run:
         config, env, network, engine = self.restored.setup
 
         def judge(state: Any, key: Any) -> dict[str, Any]:
-            return evaluate_policy(config, env, network, state, key, episodes, not stochastic)
+            length = config.episode_length
+            return evaluate_policy(env, network, state, key, episodes, length, not stochastic)
 
         def summarize(values: Any) -> Figures:
             x = np.asarray(values, float)

@@ -10,7 +10,7 @@ from purerl.core.env import Env
 from purerl.core.errors import UserError
 from purerl.core.records import Array, Network, PyTree, TrainState
 from purerl.ppo import distributions, running_moments
-from purerl.ppo.rollout import start_memory
+from purerl.ppo.episodes import start_memory
 
 
 class Policy:

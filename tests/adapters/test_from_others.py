@@ -13,7 +13,7 @@ from flax import struct
 import purerl
 from purerl import adapters, check_env
 from purerl.adapters import foreign
-from purerl.ppo.rollout import is_lost
+from purerl.ppo.episodes import is_lost
 
 pytestmark = pytest.mark.slow
 

@@ -14,7 +14,8 @@ from purerl.core.env import State
 from purerl.core.parts import WHOLE, as_one_part
 from purerl.core.records import count_as_int
 from purerl.ppo import algorithm, batches, evaluation, learner, networks, optimizer, running_moments
-from purerl.ppo.rollout import rollout, time_limits
+from purerl.ppo.episodes import time_limits
+from purerl.ppo.rollout import rollout
 from tests import quick
 from tests.ppo.test_running_moments import update as merge_batch
 
@@ -84,8 +85,8 @@ def setup(config=CONFIG, env=None, recurrent=False, seed=0):
 
 def learn(config, network, state, batch, memory):
     """Learns from one part."""
-    batch, memory, number = as_one_part((batch, memory, jnp.zeros((), jnp.int32)))
-    return learner.learn(config, network, state, batch, memory, number, WHOLE)
+    batch, memory, part_id = as_one_part((batch, memory, jnp.zeros((), jnp.int32)))
+    return learner.learn(config, network, state, batch, memory, part_id, WHOLE)
 
 
 @pytest.mark.parametrize("recurrent", [False, True])
@@ -209,9 +210,9 @@ def test_truncation_bootstraps_from_the_observation_before_the_reset():
     )
     np.testing.assert_allclose(batch.advantage, expected, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(batch.target, expected + transitions.value, rtol=1e-4, atol=1e-5)
-    first = np.asarray(batch.first)
-    np.testing.assert_array_equal(first[1:], transitions.done[:-1])
-    assert first[0].all()
+    is_first = np.asarray(batch.is_first)
+    np.testing.assert_array_equal(is_first[1:], transitions.done[:-1])
+    assert is_first[0].all()
 
 
 @pytest.mark.slow
@@ -223,12 +224,12 @@ def test_recurrent_memory_restarts_with_each_episode_in_rollout_and_learner():
         state, _ = update(state)
     assert jnp.abs(state.carry).max() > 0
     _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
-    first = state.episode.length == 0
-    batch = batches.make_batch(CONFIG, state, transitions, last_value, first)
+    is_first = state.episode.length == 0
+    batch = batches.make_batch(CONFIG, state, transitions, last_value, is_first)
     output = learner.unroll(network, state.params, batch, state.carry)
     np.testing.assert_allclose(output.value, transitions.value, rtol=1e-5, atol=1e-6)
     # By hand: at a start the memory is zero.
-    t, b = np.argwhere(np.asarray(batch.first)[1:])[0] + [1, 0]
+    t, b = np.argwhere(np.asarray(batch.is_first)[1:])[0] + [1, 0]
     features = batch.observation[t, b]
     fresh = network.apply(state.params, features, jnp.zeros(8))[0].value
     np.testing.assert_allclose(transitions.value[t, b], fresh, rtol=1e-5, atol=1e-6)
@@ -341,8 +342,8 @@ def altered(network, change):
     """The network with other parameters or another memory, which its `apply` undoes."""
 
     def init(key):
-        params, carry = network.init(key)
-        return change(params, carry)
+        params, memory = network.init(key)
+        return change(params, memory)
 
     return network._replace(init=init)
 
@@ -351,7 +352,7 @@ def altered(network, change):
 def test_parameters_of_half_precision_stay_so():
     half = altered(
         NETWORKS[False],
-        lambda params, carry: (jax.tree.map(lambda x: x.astype(jnp.bfloat16), params), carry),
+        lambda params, memory: (jax.tree.map(lambda x: x.astype(jnp.bfloat16), params), memory),
     )
     state, metrics = UPDATE(CONFIG, Walk(), half, INIT(CONFIG, Walk(), half, jax.random.key(0)))
     assert {x.dtype.name for x in jax.tree.leaves(state.params)} == {"bfloat16"}
@@ -401,17 +402,17 @@ def test_weights_have_a_sign(name, value):
 
 @pytest.mark.slow
 def test_a_memory_may_hold_integers():
-    def apply(params, observation, carry):
-        output, memory = NETWORKS[True].apply(params, observation, carry["memory"])
-        return output, {"memory": memory, "count": carry["count"] + 1}
+    def apply(params, observation, memory):
+        output, cell = NETWORKS[True].apply(params, observation, memory["cell"])
+        return output, {"cell": cell, "count": memory["count"] + 1}
 
     counting = altered(
-        NETWORKS[True], lambda params, memory: (params, {"memory": memory, "count": jnp.int32(0)})
+        NETWORKS[True], lambda params, memory: (params, {"cell": memory, "count": jnp.int32(0)})
     )._replace(apply=apply)
     state = INIT(CONFIG, Walk(), counting, jax.random.key(0))
     state, metrics = UPDATE(CONFIG, Walk(), counting, state)
     assert state.carry["count"].dtype == jnp.int32 and metrics["skipped_minibatches"] == 0
-    evaluation.evaluate_policy(CONFIG, Walk(), counting, state, jax.random.key(1), 2)
+    evaluation.evaluate_policy(Walk(), counting, state, jax.random.key(1), 2, LENGTH)
 
 
 def test_a_non_finite_minibatch_is_skipped_and_counted():

@@ -7,7 +7,7 @@ import pytest
 
 from purerl.core.parts import WHOLE
 from purerl.ppo import losses
-from purerl.ppo.running_moments import moments
+from purerl.ppo.running_moments import moments_of
 
 
 @pytest.fixture(autouse=True)
@@ -49,23 +49,23 @@ def test_value_loss():
 
 def test_weight_zero_removes_a_sample():
     x, weight = array(1.0, 100.0, 3.0), array(1.0, 0.0, 1.0)
-    normalized = losses.normalize_advantage(x, moments(x, weight > 0), 0.0, 0.0)
+    normalized = losses.normalize_advantage(x, moments_of(x, weight > 0), 0.0, 0.0)
     np.testing.assert_allclose(normalized[jnp.array([0, 2])], [-1.0, 1.0], rtol=1e-6)
 
 
 def test_advantage_normalized_over_all_axes():
     advantage = jax.random.normal(jax.random.key(0), (7, 5)) * 3.0 + 2.0
-    scale = moments(advantage, jnp.ones((7, 5), bool))
-    normalized = np.asarray(losses.normalize_advantage(advantage, scale, 0.0, 0.0))
+    moments = moments_of(advantage, jnp.ones((7, 5), bool))
+    normalized = np.asarray(losses.normalize_advantage(advantage, moments, 0.0, 0.0))
     np.testing.assert_allclose(normalized.mean(), 0.0, atol=1e-6)
     np.testing.assert_allclose(normalized.std(), 1.0, rtol=1e-5)
 
 
 def test_one_failure_among_alike_samples_is_clipped_and_the_others_are_not():
     advantage = jnp.zeros(100).at[3].set(-1.0)
-    scale = moments(advantage, jnp.ones(100, bool))
-    whole = losses.normalize_advantage(advantage, scale, 0.0, 0.0)
-    clipped = losses.normalize_advantage(advantage, scale, 0.0, 4.0)
+    moments = moments_of(advantage, jnp.ones(100, bool))
+    whole = losses.normalize_advantage(advantage, moments, 0.0, 0.0)
+    clipped = losses.normalize_advantage(advantage, moments, 0.0, 4.0)
     np.testing.assert_allclose(whole[3], -np.sqrt(99.0), rtol=1e-5)
     np.testing.assert_array_equal(clipped, whole.at[3].set(-4.0))
 
@@ -74,8 +74,8 @@ def test_one_failure_among_alike_samples_is_clipped_and_the_others_are_not():
 def test_advantages_far_below_their_least_deviation_stay_small(size, expected):
     """Where nothing is rewarded, they are errors of the value, and no reason to move."""
     advantage = size * jax.random.normal(jax.random.key(0), (1000,))
-    scale = moments(advantage, jnp.ones(1000, bool))
-    normalized = losses.normalize_advantage(advantage, scale, 0.01, 0.0)
+    moments = moments_of(advantage, jnp.ones(1000, bool))
+    normalized = losses.normalize_advantage(advantage, moments, 0.01, 0.0)
     np.testing.assert_allclose(normalized.std(), expected, rtol=0.05)
 
 
@@ -86,7 +86,7 @@ def test_the_entropy_of_an_action_counts_up_to_its_target(target, expected):
 
 
 def test_kl_estimate_is_unbiased_and_never_negative():
-    """Two Gaussians of scale 1 whose means differ by 0.3: KL = 0.3^2 / 2."""
+    """Two Gaussians of moments 1 whose means differ by 0.3: KL = 0.3^2 / 2."""
     x = jax.random.normal(jax.random.key(0), (200_000,))
     log_ratio = -0.5 * jnp.square(x - 0.3) + 0.5 * jnp.square(x)
     estimate = losses.approximate_kl(log_ratio)

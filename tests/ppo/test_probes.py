@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 from purerl.ppo import advantages, algorithm, distributions, losses, networks, running_moments
-from purerl.ppo.rollout import act
+from purerl.ppo.episodes import act
 from tests import quick
 from tests.ppo.probes import Probe
 

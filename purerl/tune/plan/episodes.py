@@ -12,8 +12,9 @@ from purerl.core.env import Env, State
 from purerl.core.keys import Purpose, derive, per_environment
 from purerl.core.records import Array
 from purerl.devices.compilation import jit
-from purerl.ppo import evaluation, rollout
+from purerl.ppo import evaluation
 from purerl.ppo.config import Config
+from purerl.ppo.episodes import episode_metrics
 from purerl.ppo.evaluation import Progress
 from purerl.tune.plan import planner
 from purerl.tune.plan.planner import Guide, Plan
@@ -41,7 +42,7 @@ def begin(
 ) -> Playing:
     """Returns E episodes about to start, by a key [] that nothing else uses."""
     nothing: Any = NoMemory()
-    progress = evaluation.start(config, env, nothing, key, number)
+    progress = evaluation.start(env, nothing, key, number, config.episode_length)
     plans = jax.tree.map(
         lambda x: jnp.broadcast_to(x, (number, *x.shape)), planner.start(settings, env, guide)
     )
@@ -77,15 +78,15 @@ def advance(
     step_key = jax.random.fold_in(key, now.t)
     keys = per_environment(step_key, jnp.arange(number))
     choose = functools.partial(planner.plan, settings, env, guide)
-    plans, action = jax.vmap(choose)(playing.plan, now.env, keys)
+    plans, action = jax.vmap(choose)(playing.plan, now.env_state, keys)
     following = evaluation.advance(env, now, action, ())
-    judged = {name: judge_step(judge, now.env, action) for name, judge in judges.items()}
+    judged = {name: judge_step(judge, now.env_state, action) for name, judge in judges.items()}
     row = {
         "running": ~(now.over | following.lost),
-        "kept": jax.vmap(keep)(now.env),
+        "kept": jax.vmap(keep)(now.env_state),
         "action": action,
-        "reward": following.env.reward,
-        "metrics": following.env.metrics,
+        "reward": following.env_state.reward,
+        "metrics": following.env_state.metrics,
         "judged": judged,
     }
     return Playing(following, plans), row
@@ -150,7 +151,7 @@ def episodes(
 def results(playing: Playing) -> dict[str, np.ndarray]:
     """Returns figures of episodes that are over, name -> [E], as `evaluation.evaluate_policy`."""
     progress = playing.progress
-    found = rollout.episode_metrics(progress.episode) | {
+    found = episode_metrics(progress.episode) | {
         "episode_return": progress.episode.episode_return,
         "episode_length": progress.episode.length.astype(jnp.float32),
         "lost": progress.lost.astype(jnp.float32),

@@ -35,7 +35,7 @@ def film(
       end: the episodes, over.
       rows: of `episodes.episodes`, with pictures kept.
     """
-    last = jax.device_get(jax.vmap(keep_picture(env))(end.progress.env))
+    last = jax.device_get(jax.vmap(keep_picture(env))(end.progress.env_state))
     kept = [row["kept"] for row in rows] + [jax.tree.map(lambda x: x[None], last)]
     pictures = jax.tree.map(lambda *parts: np.concatenate(parts), *kept)
     running = np.concatenate([row["running"] for row in rows])

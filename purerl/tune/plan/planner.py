@@ -24,7 +24,7 @@ import numpy as np
 
 from purerl.core.env import Env, State
 from purerl.core.records import Array, Network, PyTree, TrainState
-from purerl.ppo import batches, distributions, rollout
+from purerl.ppo import batches, distributions, episodes
 from purerl.ppo.config import Config
 from purerl.tune.plan import splines
 from purerl.tune.plan.settings import Settings
@@ -69,7 +69,7 @@ def guide(config: Config, network: Network, state: TrainState) -> Guide:
     factor = batches.reward_factor(config, state)
 
     def act(env: State, memory: PyTree) -> tuple[Array, Array, PyTree]:
-        output, memory = rollout.act(network, state, env, memory)
+        output, memory = episodes.act(network, state, env, memory)
         return distributions.to_action(output.distribution.loc), output.value / factor, memory
 
     memory = jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), state.carry)
@@ -204,7 +204,7 @@ def play(
     _, value, _ = guide.act(state, memory)
     due += weight
     total += jnp.where(due > 0.0, due * value, 0.0)
-    lost = (weight > 0.0) & jax.vmap(rollout.is_lost)(state)
+    lost = (weight > 0.0) & jax.vmap(episodes.is_lost)(state)
     return jnp.where(lost | ~jnp.isfinite(total), -jnp.inf, total)
 
 

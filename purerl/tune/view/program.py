@@ -20,7 +20,7 @@ from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.keys import Purpose, derive
 from purerl.core.records import Array, PyTree
 from purerl.devices.compilation import jit, start as compile_beside
-from purerl.ppo import rollout
+from purerl.ppo.episodes import is_lost
 from purerl.report.episode_pictures import Picture, take_picture
 from purerl.tune.view.drivers import Driver
 from purerl.tune.view.option_numbers import Place, numbers_of, replaced
@@ -188,6 +188,6 @@ def move(env: Any, driver: Driver, brain: PyTree, moment: Moment) -> tuple[Momen
         value=value,
         terminated=state.terminated,
         truncated=state.truncated,
-        lost=rollout.is_lost(state),
+        lost=is_lost(state),
     )
     return Moment(state, memory, moment.key, moment.step + 1), shown
