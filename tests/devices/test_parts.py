@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from purerl.core.parts import WHOLE, add_in_order, as_one_part
+from purerl.core.parts import WHOLE
 from purerl.devices import programs, shards
 from purerl.devices.shards import Shards, parts_of
 from purerl.devices.slices import count_slices, cut_in_slices
@@ -52,7 +52,7 @@ def test_a_gradient_step_is_the_same_in_parts(name, recurrent):
         pieces, memories = cut(number, 1, batch), cut(number, 0, memory)
         size = pieces.weight.shape[2]
         order = jnp.tile(jnp.arange(size), (number, 1, 1))  # one minibatch of all columns
-        scale = jax.tree.map(lambda x: x[0], learner.advantage_scales(pieces, order, parts))
+        scale = jax.tree.map(lambda x: x[0], learner.minibatch_moments(pieces, order, parts))
         return learner.minibatch_step(config, network, begin, pieces, memories, scale, parts)
 
     whole, metrics = step(1, WHOLE)
@@ -83,7 +83,7 @@ def test_advantages_of_a_minibatch_are_scaled_by_its_own(name):
     weight = jax.random.bernoulli(jax.random.key(1), 0.8, shape).astype(jnp.float32)
     batch = batches.Batch(*[advantage] * 9)._replace(weight=weight, noise=None)
     order = learner.shuffle(jax.random.key(2), jnp.arange(number), 12, 3)
-    found = learner.advantage_scales(batch, order, parts)
+    found = learner.minibatch_moments(batch, order, parts)
     for k in range(3):
         taken = [
             np.asarray(x)[v, 0][np.asarray(order)[v, k]]
@@ -91,7 +91,7 @@ def test_advantages_of_a_minibatch_are_scaled_by_its_own(name):
             for v in range(number)
         ]
         values, counts = np.concatenate(taken[:number]), np.concatenate(taken[number:]) > 0
-        assert found.number[k] == counts.sum()
+        assert found.num_samples[k] == counts.sum()
         np.testing.assert_allclose(found.mean[k], values[counts].mean(), rtol=1e-4)
         np.testing.assert_allclose(found.variance[k], values[counts].var(), rtol=1e-4)
 
@@ -116,7 +116,7 @@ def test_slices_hold_whole_environments():
     env, network, state = setup()
     experience = algorithm.collect(CONFIG, env, network, state)[1]
     sliced = cut_in_slices(3, experience)
-    assert sliced.batch.weight.shape == (3, 16, 2) and sliced.number.tolist() == [
+    assert sliced.batch.weight.shape == (3, 16, 2) and sliced.env_ids.tolist() == [
         [0, 1], [2, 3], [4, 5],
     ]  # fmt: skip
     for i in range(3):
@@ -157,14 +157,6 @@ def test_on_a_gpu_minibatches_are_cut_in_slices(monkeypatch):
     assert metrics["skipped_minibatches"] == 0 and metrics["gradient_norm"] > 0
 
 
-def test_parts_add_in_one_order_whatever_their_number():
-    x = jax.random.normal(jax.random.key(0), (7, 3)) * 10.0 ** jnp.arange(7)[:, None]
-    a, b, c, d, e, f, g = np.asarray(x)
-    expected = ((a + d) + (c + f)) + ((b + e) + g)
-    np.testing.assert_allclose(add_in_order(x), expected, rtol=1e-6)
-    assert add_in_order(jnp.array([1e8, 1.0, -1e8, 1.0])) == 2.0  # (a + c) + (b + d)
-
-
 def test_pooled_moments_are_those_of_all_samples():
     samples = jax.random.normal(jax.random.key(1), (4, 5, 2)) * 3.0 + 40.0
     valid = jax.random.bernoulli(jax.random.key(2), 0.7, (4, 5)).at[1].set(False)
@@ -174,11 +166,3 @@ def test_pooled_moments_are_those_of_all_samples():
     whole = merge_batch(start, samples.reshape(20, 2), valid.reshape(20))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), pooled, whole)
     assert pooled.count.low == 5 + valid.sum()
-
-
-def test_one_part_is_the_plain_call():
-    tree = as_one_part({"x": jnp.arange(3.0)})
-    assert WHOLE.map(lambda t: t["x"].sum(), tree).tolist() == [3.0]
-    assert WHOLE.sum(lambda t: t["x"].sum(), tree) == 3.0
-    with pytest.raises(ValueError):
-        WHOLE.map(lambda x: x, jnp.zeros((2, 3)))  # two parts are not one
