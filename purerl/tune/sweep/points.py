@@ -122,18 +122,21 @@ def _bool_word(name: str, text: str) -> str:
     return text.capitalize()
 
 
-def check(base: Base, values: Values) -> Experiment:
-    """Returns the experiment of a point; UserError if its settings break a rule together."""
-    typed = {name: read_value(base, name, text) for name, text in values.items()}
-    return check_typed(base, values, typed)
+def typed_values(base: Base, points: Sequence[Point]) -> list[dict[str, Any]]:
+    """Returns each point's settings with their values: each text is read once, for it takes long.
+
+    Raises:
+      UserError: a value is of the wrong type.
+    """
+    pairs = {pair for point in points for pair in point.values.items()}
+    read = {pair: read_value(base, *pair) for pair in sorted(pairs)}
+    return [{name: read[name, text] for name, text in one.values.items()} for one in points]
 
 
 def check_all(base: Base, points: Sequence[Point]) -> None:
-    """Checks every point; each value is read once, since reading takes most of the time."""
-    pairs = {pair for point in points for pair in point.values.items()}
-    read = {pair: read_value(base, *pair) for pair in sorted(pairs)}
-    for point in points:
-        check_typed(base, point.values, {n: read[n, text] for n, text in point.values.items()})
+    """Raises UserError if the settings of a point break a rule together."""
+    for point, typed in zip(points, typed_values(base, points), strict=True):
+        _check(base, point.values, typed)
 
 
 def check_evaluated(base: Base, spaces: Sequence[Space], metric: str) -> None:
@@ -148,8 +151,7 @@ def check_evaluated(base: Base, spaces: Sequence[Space], metric: str) -> None:
         )
 
 
-def check_typed(base: Base, values: Values, typed: Mapping[str, Any]) -> Experiment:
-    """Returns the experiment with a point's values; UserError if they break a rule together."""
+def _check(base: Base, values: Values, typed: Mapping[str, Any]) -> None:
     tree: dict[str, Any] = {}
     for name, value in typed.items():
         *path, last = name.replace("-", "_").split(".")
@@ -158,7 +160,7 @@ def check_typed(base: Base, values: Values, typed: Mapping[str, Any]) -> Experim
             place = place.setdefault(part, {})
         place[last] = value
     try:
-        return _replace(base.chosen, tree)
+        _replace(base.chosen, tree)
     except Exception as error:  # a rule of a dataclass, of ours or the user's
         shown = " ".join(f"{name}={text}" for name, text in values.items())
         raise UserError(f"The point {shown}: {one_line(error)}") from error

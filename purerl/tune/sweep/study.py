@@ -53,7 +53,7 @@ def propose(study: Any, spaces: Sequence[Space], number: int) -> Iterator[Point]
     yield from (point for point in known(study, spaces) if point.number in open_ones)
     while len(known(study, spaces)) < number:
         study.sampler = _sampler(len(study.get_trials(deepcopy=False)))
-        trial = study.ask(_distributions(spaces))
+        trial = study.ask({space.setting: _distribution(space) for space in spaces})
         yield Point(trial.number, {s.setting: _text(s, trial.params) for s in spaces})
 
 
@@ -74,23 +74,14 @@ def _sampler(seed: int) -> Any:
     return TPESampler(seed=seed, n_startup_trials=FIRST)
 
 
-def _distributions(spaces: Sequence[Space]) -> dict[str, Any]:
-    from optuna.distributions import (
-        CategoricalDistribution,
-        FloatDistribution,
-        IntDistribution,
-    )
+def _distribution(space: Space) -> Any:
+    from optuna import distributions as known
 
-    found: dict[str, Any] = {}
-    for space in spaces:
-        if space.choices:
-            found[space.setting] = CategoricalDistribution(space.choices)
-        elif space.whole:
-            ends = round(space.low), round(space.high)
-            found[space.setting] = IntDistribution(*ends, log=space.log)
-        else:
-            found[space.setting] = FloatDistribution(space.low, space.high, log=space.log)
-    return found
+    if space.choices:
+        return known.CategoricalDistribution(space.choices)
+    if space.whole:
+        return known.IntDistribution(round(space.low), round(space.high), log=space.log)
+    return known.FloatDistribution(space.low, space.high, log=space.log)
 
 
 def _text(space: Space, params: dict[str, Any]) -> str:

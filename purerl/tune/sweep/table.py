@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from purerl.core.errors import UserError
 from purerl.report import comparison, run_reader
 from purerl.report.seed_statistics import Group, check_scored, summarize
-from purerl.tune.sweep.points import Base, Point, job, read_value
+from purerl.tune.sweep.points import Base, Point, job, typed_values
 from purerl.tune.sweep.scheduler import how_it_ended, is_locked
 from purerl.tune.sweep.spaces import Space
 
@@ -28,10 +28,8 @@ class Row(NamedTuple):
 
 def make_rows(base: Base, points: Sequence[Point], metric: str) -> list[Row]:
     """Returns a row for each point, best first; numbers stand in the order of numbers."""
-    pairs = {pair for point in points for pair in point.values.items()}
-    read = {pair: read_value(base, *pair) for pair in sorted(pairs)}
     rows = []
-    for point in points:
+    for point, typed in zip(points, typed_values(base, points), strict=True):
         one = job(base, point)
         found = how_it_ended(one)
         status = found.status
@@ -39,7 +37,6 @@ def make_rows(base: Base, points: Sequence[Point], metric: str) -> list[Row]:
             status = "training"
         elif status == "stopped" and not one.log.exists():
             status = "waiting"
-        typed = {name: read[name, text] for name, text in point.values.items()}
         summary = summarize(group_of(base, point), metric)
         rows.append(Row(point, typed, status, found.said, summary))
     return sorted(rows, key=_rank)
