@@ -14,18 +14,19 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
+from purerl.experiment.command_line import main_of_words
 from purerl.machine import output
 from purerl.machine.command_errors import leave
 
 PROG = "python -m purerl.plan"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
+def show_help(words: Sequence[str]) -> None:
+    """Prints the help page."""
+    from purerl.tune import subject
     from purerl.tune.plan.problem import PlanCommandOptions
-    from purerl.tune.subject import carry_out_on_subject
 
-    return carry_out_on_subject(command, PlanCommandOptions, __doc__, PROG, arguments)
+    subject.show_help(PlanCommandOptions, __doc__, PROG, words)
 
 
 def command(words: Sequence[str]) -> None:
@@ -89,6 +90,9 @@ def same(some: Any, others: Any) -> bool:
     return ours.keys() == theirs.keys() and all(
         np.array_equal(ours[name], theirs[name]) for name in ours
     )
+
+
+main = main_of_words(command, show_help)
 
 
 if __name__ == "__main__":

@@ -22,12 +22,11 @@ returns from `reward` here. Every array but `length` is [N, T, ...]: N episodes 
 MuJoCo's model, to compute from `qpos` where limbs are, is `purerl.load(RUN).env.physics.model`.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from purerl.core.errors import UserError
-from purerl.experiment.command_line import carry_out
+from purerl.experiment.command_line import main_of
 from purerl.experiment.options import PlayOptions
 from purerl.machine.command_errors import leave
 from purerl.machine.files import check_writable, write_arrays
@@ -44,11 +43,6 @@ class RecordOptions(PlayOptions):  # noqa: D101 (--help prints the page above)
     """Whole episodes, N."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    return carry_out(RecordOptions, command, "python -m purerl.record", arguments)
-
-
 def command(options: RecordOptions) -> None:
     """Writes the file and tells what is in it."""
     from purerl.report.episode_arrays import record
@@ -61,6 +55,9 @@ def command(options: RecordOptions) -> None:
     arrays = record(run.restored.setup, run.state, options.seed, options.episodes)
     write_arrays(options.out, arrays)
     show(*(f"{name:32} {x.dtype} {list(x.shape)}" for name, x in arrays.items()), str(options.out))
+
+
+main = main_of(RecordOptions, command, "python -m purerl.record")
 
 
 if __name__ == "__main__":

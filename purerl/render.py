@@ -5,11 +5,10 @@ episode's own geometry; <update>.png beside it shows 16 moments of it. No screen
 """
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from purerl.core.errors import UserError
-from purerl.experiment.command_line import carry_out
+from purerl.experiment.command_line import main_of
 from purerl.experiment.options import PlayOptions
 from purerl.machine.command_errors import leave
 from purerl.machine.output import show
@@ -27,11 +26,6 @@ class RenderOptions(PlayOptions):
     """At most so much of each episode [s]."""
     size: str = "640x480"
     """Width x height of a frame [pixels], both even."""
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    return carry_out(RenderOptions, command, "python -m purerl.render", arguments)
 
 
 def command(options: RenderOptions) -> None:
@@ -70,6 +64,9 @@ def _parse_size(size: str) -> tuple[int, int]:
             f"size is {size}; width and height must be even and from 16 to 4096 pixels."
         )
     return width, height
+
+
+main = main_of(RenderOptions, command, "python -m purerl.render")
 
 
 if __name__ == "__main__":
