@@ -86,10 +86,8 @@ def same(some: Any, others: Any) -> bool:
     import jax
     import numpy as np
 
-    ours, theirs = (dict(jax.tree_util.tree_leaves_with_path(x)) for x in (some, others))
-    return ours.keys() == theirs.keys() and all(
-        np.array_equal(ours[name], theirs[name]) for name in ours
-    )
+    alike = jax.tree.structure(some) == jax.tree.structure(others)
+    return alike and jax.tree.all(jax.tree.map(np.array_equal, some, others))
 
 
 main = main_of_words(command, show_help)

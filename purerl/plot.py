@@ -46,10 +46,7 @@ def command(options: PlotOptions) -> None:
     columns, rows = shutil.get_terminal_size((100, 30))
     show(*draw(curves, options.metric, columns, min(rows - 6, 24)))
     if options.out is not None:
-        try:
-            comparison.draw_curves(options.out, curves, options.metric)
-        except OSError as error:
-            raise UserError(f"{options.out} cannot be written: {error.strerror}.") from error
+        comparison.draw_curves(options.out, curves, options.metric)
         show(str(options.out))
 
 

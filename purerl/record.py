@@ -25,7 +25,7 @@ MuJoCo's model, to compute from `qpos` where limbs are, is `purerl.load(RUN).env
 from dataclasses import dataclass
 from pathlib import Path
 
-from purerl.core.errors import UserError
+from purerl.core.errors import UserError, check_least
 from purerl.experiment.command_line import main_of
 from purerl.experiment.options import PlayOptions
 from purerl.machine.command_errors import leave
@@ -48,8 +48,7 @@ def command(options: RecordOptions) -> None:
     from purerl.report.episode_arrays import record
     from purerl.runs.loaded_run import load
 
-    if options.episodes < 1:
-        raise UserError(f"episodes is {options.episodes}; it must be at least 1.")
+    check_least(options, UserError, episodes=1)
     check_writable(options.out)
     run = load(options.run, options.checkpoint, options.engine, options.trust)
     arrays = record(run.restored.setup, run.state, options.seed, options.episodes)

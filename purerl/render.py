@@ -7,7 +7,7 @@ episode's own geometry; <update>.png beside it shows 16 moments of it. No screen
 import re
 from dataclasses import dataclass
 
-from purerl.core.errors import UserError
+from purerl.core.errors import UserError, check_least
 from purerl.experiment.command_line import main_of
 from purerl.experiment.options import PlayOptions
 from purerl.machine.command_errors import leave
@@ -38,9 +38,7 @@ def make(options: RenderOptions) -> list[str]:
     from purerl.report.opengl import open_gl
 
     size = _parse_size(options.size)
-    for name, least in (("episodes", 1), ("seconds", 0.1)):
-        if not getattr(options, name) >= least:
-            raise UserError(f"{name} is {getattr(options, name)}; it must be at least {least}.")
+    check_least(options, UserError, episodes=1, seconds=0.1)
     # First of all: what follows imports mujoco, which looks for OpenGL itself.
     open_gl(*size).free()
 

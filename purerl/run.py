@@ -65,13 +65,12 @@ def _train(words: Sequence[str]) -> None:
 
         if is_first():
             shown = render.RenderOptions(folders[0], trust=True)
-            files: list[str] = []
-            if _attempt("video", _show_policy, shown, files):
-                _attempt("video for the loggers", _log_video, options, folders[0], files[-1])
+            if file := _attempt("video", _show_policy, shown):
+                _attempt("video for the loggers", _log_video, options, folders[0], Path(file))
 
 
-def _show_policy(options: Any, files: list[str]) -> None:
-    """Makes a video, and adds its path to `files`.
+def _show_policy(options: Any) -> str:
+    """Makes a video; returns its path.
 
     Training has ended, and nothing that cannot be printed is a failure of it.
     """
@@ -79,26 +78,24 @@ def _show_policy(options: Any, files: list[str]) -> None:
 
     for line in (lines := render.make(options)):
         output.say(line)
-    files.append(lines[-1])
+    return lines[-1]
 
 
-def _log_video(options: Any, folder: Path, video: str) -> None:
+def _log_video(options: Any, folder: Path, video: Path) -> None:
     """Hands the video to TensorBoard and W&B, if the run has them."""
     from purerl.report.video_loggers import log_video
 
-    path = Path(video)
-    for line in log_video(options, folder, path, int(path.stem.partition("_")[0])):
+    for line in log_video(options, folder, video, int(video.stem.partition("_")[0])):
         output.say(line)
 
 
-def _attempt(what: str, part: Callable[..., Any], *arguments: Any) -> bool:
-    """Calls a part of making a video; a failure is one line, and changes no exit code."""
+def _attempt(what: str, part: Callable[..., Any], *arguments: Any) -> Any:
+    """Returns what a part of making a video does; a failure is a line, and changes no exit code."""
     try:
-        part(*arguments)
+        return part(*arguments)
     except Exception as error:
         output.warn(f"purerl: There is no {what}: {one_line(error)}")
-        return False
-    return True
+        return None
 
 
 main = main_of_words(command, show_help)

@@ -7,6 +7,7 @@ anew. The run's plan says so.
 """
 
 import difflib
+import functools
 import sys
 import threading
 from collections import OrderedDict
@@ -153,12 +154,10 @@ class _Episode:
 
 def warned_once(make: Callable[[], gymnasium.Env]) -> Callable[[], gymnasium.Env]:
     """Returns `make`, of which MuJoCo says each warning once: each episode compiles its XML."""
-    told: set[str] = set()
 
+    @functools.cache
     def tell(text: str) -> None:
-        if text not in told:
-            told.add(text)
-            print(f"MuJoCo: {text.strip()}", file=sys.stderr)
+        print(f"MuJoCo: {text.strip()}", file=sys.stderr)
 
     def made() -> gymnasium.Env:
         mujoco.set_mju_user_warning(tell)

@@ -4,14 +4,13 @@ from typing import Any
 
 import gymnasium
 import jax
-import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from purerl.adapters.stepping import Drawer, check_length, example, sound_step, to_numpy
+from purerl.adapters.stepping import Drawer, check_length, choose, example, sound_step, to_numpy
 from purerl.core.env import Env, State
-from purerl.core.records import Array, PyTree
+from purerl.core.records import Array
 
 
 def spaces(env: Env) -> tuple[gymnasium.Space, gymnasium.Space]:
@@ -108,7 +107,7 @@ class GymnasiumVectorEnv(VectorEnv):
         self.action_space = batch_space(self.single_action_space, number)
         self._start = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, number)))
         self._step = jax.jit(jax.vmap(sound_step(env)))
-        self._replace = jax.jit(_replace)
+        self._choose = jax.jit(jax.vmap(choose))
 
     def reset(
         self, *, seed: int | None = None, options: dict | None = None
@@ -126,7 +125,7 @@ class GymnasiumVectorEnv(VectorEnv):
         stepped, lost = self._step(self.state, np.asarray(actions, np.float32))
         if begun.any():
             fresh = self._start(new_key(self.np_random))
-            stepped = self._replace(begun, fresh, stepped)
+            stepped = self._choose(begun, fresh, stepped)
         self.state = stepped
         self.steps = np.where(begun, 0, self.steps + 1)
         terminated = np.array(stepped.terminated)
@@ -139,13 +138,6 @@ class GymnasiumVectorEnv(VectorEnv):
 
     def _infos(self, lost: np.ndarray) -> dict[str, Any]:
         return to_numpy(self.state.metrics) | {"lost": lost}
-
-
-def _replace(condition: Array, new: PyTree, old: PyTree) -> PyTree:
-    def one(a: Array, b: Array) -> Array:
-        return jnp.where(jnp.expand_dims(condition, tuple(range(1, b.ndim))), a, b)
-
-    return jax.tree.map(one, new, old)
 
 
 def gymnasium_vector_env(env: Env, number: int, episode_length: int = 1000) -> GymnasiumVectorEnv:

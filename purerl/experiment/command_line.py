@@ -172,9 +172,16 @@ def _words(name: str, value: Any) -> list[str]:
 
 
 def parse(
-    kind: Any, arguments: Sequence[str], prog: str, default: Any = None, config: Any = CONFIG
+    kind: Any,
+    arguments: Sequence[str],
+    prog: str,
+    default: Any = None,
+    config: Any = CONFIG,
+    **more: Any,
 ) -> Any:
     """Parses a command line into the dataclass `kind`; `--help` prints a page and exits.
+
+    `more` is for `tyro.cli`, such as `return_unknown_args=True`.
 
     Raises:
       UserError: there is no such option (the message has the nearest one), or a value is wrong.
@@ -183,7 +190,7 @@ def parse(
     extra = {} if default is None else {"default": default}
     try:
         with output.answering(), contextlib.redirect_stderr(said):
-            return tyro.cli(kind, args=list(arguments), prog=prog, config=config, **extra)
+            return tyro.cli(kind, args=list(arguments), prog=prog, config=config, **extra, **more)
     except SystemExit as error:
         if not error.code:
             raise

@@ -7,12 +7,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from purerl.physics.drawing import (
-    Picture,
-    Stage,
-    add_scenery,
-    root_body as root_body,  # for rooms that may not import physics
-)
+# The last one is for rooms that may not import physics.
+from purerl.physics.drawing import Picture, Stage, add_scenery, root_body  # noqa: F401
 from purerl.report.opengl import open_gl
 
 

@@ -79,7 +79,7 @@ def read(path: Path) -> RunRecord:
     return RunRecord(
         path=path,
         seed=settings["seed"],
-        settings=experiment | _flatten(learning) | experiment | _went_on(folder),
+        settings=experiment | flatten(learning) | experiment | _went_on(folder),
         manifest=folder.manifest,
         source=folder.code,
         lines=[_check_line(f"{file}, line {i}", x) for i, x in enumerate(read_metrics(file), 1)],
@@ -120,11 +120,11 @@ def _is_finite(value: float) -> bool:
     return abs(value) <= sys.float_info.max
 
 
-def _flatten(value: Any, path: str = "") -> dict[str, Any]:
+def flatten(value: Any, path: str = "") -> dict[str, Any]:
     """Returns nested settings as {"a.b": value}; lists stay whole."""
     if not isinstance(value, dict):
         return {path: value}
-    inner = [_flatten(v, f"{path}.{k}" if path else k) for k, v in value.items()]
+    inner = [flatten(v, f"{path}.{k}" if path else k) for k, v in value.items()]
     return {k: v for part in inner for k, v in part.items()}
 
 

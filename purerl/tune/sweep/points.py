@@ -15,6 +15,7 @@ from purerl.experiment.definition import Experiment
 from purerl.experiment.kinds import hints
 from purerl.experiment.loading import Source
 from purerl.experiment.options import RunOptions
+from purerl.tune.option_numbers import Place, replaced
 from purerl.tune.sweep.scheduler import Job
 from purerl.tune.sweep.spaces import Space, Values, parse_space
 
@@ -41,11 +42,6 @@ class Base(NamedTuple):
     seeds: int
     folder: Path  # of the sweep
     options: RunOptions  # of each run, as the words give them
-
-    @property
-    def name(self) -> str:
-        """The experiment's name."""
-        return self.source.name
 
 
 def read_spaces(base: Base, texts: Iterable[str], given: Sequence[str]) -> list[Space]:
@@ -152,27 +148,14 @@ def check_evaluated(base: Base, spaces: Sequence[Space], metric: str) -> None:
 
 
 def _check(base: Base, values: Values, typed: Mapping[str, Any]) -> None:
-    tree: dict[str, Any] = {}
-    for name, value in typed.items():
-        *path, last = name.replace("-", "_").split(".")
-        place = tree
-        for part in path:
-            place = place.setdefault(part, {})
-        place[last] = value
+    places: dict[Place, Any] = {
+        tuple(name.replace("-", "_").split(".")): value for name, value in typed.items()
+    }
     try:
-        _replace(base.chosen, tree)
+        replaced(base.chosen, places)
     except Exception as error:  # a rule of a dataclass, of ours or the user's
         shown = " ".join(f"{name}={text}" for name, text in values.items())
         raise UserError(f"The point {shown}: {one_line(error)}") from error
-
-
-def _replace(value: Any, tree: Mapping[str, Any]) -> Any:
-    """Returns a dataclass's value with new fields, at any depth, each made only once."""
-    changed = {
-        name: _replace(getattr(value, name), new) if isinstance(new, dict) else new
-        for name, new in tree.items()
-    }
-    return dataclasses.replace(value, **changed)
 
 
 def option_words(base: Base, name: str, text: str) -> list[str]:
@@ -197,7 +180,7 @@ def job(base: Base, point: Point) -> Job:
         words += ["--num-seeds", str(base.seeds)]
         first = base.chosen.seed
         names = [f"{point.name}-seed{first + i}" for i in range(base.seeds)]
-    folders = tuple(base.folder / base.name / name for name in names)
+    folders = tuple(base.folder / base.source.name / name for name in names)
     return Job(point.name, tuple(words), folders, base.folder / "logs" / f"{point.name}.log")
 
 

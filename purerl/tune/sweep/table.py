@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import UserError
+from purerl.machine.files import writing
 from purerl.report import comparison, run_reader
 from purerl.report.seed_statistics import Group, check_scored, summarize
 from purerl.tune.sweep.points import Base, Point, job, typed_values
@@ -137,9 +138,7 @@ def write(
     files = {kind: folder / f"sweep.{kind}" for kind in ("csv", "txt")}
     names = ["point", *(space.setting for space in spaces)]
     names += ["n", "iqm", "low", "high", "mean", "worst", "status", "said"]
-    try:
+    with writing(folder):
         comparison.write_csv(files["csv"], names, map(as_record, rows))
         files["txt"].write_text("\n".join(lines) + "\n", errors="backslashreplace")
-    except OSError as error:
-        raise UserError(f"{folder} cannot be written: {error.strerror}.") from error
     return files

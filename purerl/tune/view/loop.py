@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from purerl.checks.user_code import program_errors
 from purerl.core.errors import RunError, UserError, one_line
+from purerl.tune.option_numbers import label
 from purerl.tune.view import session as events
 from purerl.tune.view.opening import Source
-from purerl.tune.view.option_numbers import label
 from purerl.tune.view.session import Session, advance, to_build
 
 if TYPE_CHECKING:

@@ -19,10 +19,10 @@ from purerl.runs.folder import CHECKPOINTS, CODE
 from purerl.runs.loaded_run import Run
 from purerl.runs.restored_run import read_checkpoint
 from purerl.tune import overrides
+from purerl.tune.option_numbers import replaced
 from purerl.tune.plan import planner
 from purerl.tune.subject import Subject
 from purerl.tune.view.drivers import Driver, planner_driver, policy_driver
-from purerl.tune.view.option_numbers import replaced
 from purerl.tune.view.program import Numbers, build_program
 from purerl.tune.view.session import Session, open_session
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import viser
 
+from purerl.tune.option_numbers import Place, bounds, label
 from purerl.tune.view import readouts, session as events
-from purerl.tune.view.option_numbers import Place, bounds, label
 from purerl.tune.view.scene import Scene
 from purerl.tune.view.session import Session
 

@@ -22,8 +22,8 @@ from purerl.core.records import Array, PyTree
 from purerl.devices.compilation import jit, start as compile_beside
 from purerl.ppo import rollout
 from purerl.report.episode_pictures import Picture, take_picture
+from purerl.tune.option_numbers import Place, numbers_of, replaced
 from purerl.tune.view.drivers import Driver
-from purerl.tune.view.option_numbers import Place, numbers_of, replaced
 
 Numbers = Mapping[Place, int | float]
 

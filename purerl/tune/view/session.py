@@ -11,8 +11,8 @@ import numpy as np
 
 from purerl.report.episode_pictures import Picture
 from purerl.report.renderer import root_body
+from purerl.tune.option_numbers import Place
 from purerl.tune.view import push as pushes
-from purerl.tune.view.option_numbers import Place
 from purerl.tune.view.program import Moment, Program, Shown, episode_key
 
 SECONDS_KEPT = 8.0  # of an episode, for the plots [s]

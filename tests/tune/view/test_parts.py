@@ -14,8 +14,8 @@ from purerl.experiment.command_line import from_command_line
 from purerl.experiment.loading import find_source
 from purerl.physics.drawing import Picture, Stage
 from purerl.tune import overrides
+from purerl.tune.option_numbers import bounds, label, numbers_of, replaced
 from purerl.tune.view import loop, opening, push, shapes
-from purerl.tune.view.option_numbers import bounds, label, numbers_of, replaced
 
 # --- numbers ---
 

@@ -18,10 +18,10 @@ from PIL import Image
 from purerl import UserError, load, run as train, view
 from purerl.core.errors import USAGE
 from purerl.tune import subject
+from purerl.tune.option_numbers import replaced
 from purerl.tune.plan import planner
 from purerl.tune.view import opening
 from purerl.tune.view.drivers import policy_driver
-from purerl.tune.view.option_numbers import replaced
 from purerl.tune.view.program import build_program, episode_key
 from purerl.tune.view.session import Push, Step, advance, open_session, take_step
 from tests.report import chromium
