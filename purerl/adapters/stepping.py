@@ -27,21 +27,19 @@ def sound_step(env: Env) -> Callable[[State, Array], tuple[State, Array]]:
         state = env.step(before, action)
         lost = is_lost(state)
 
+        def unless_lost(new: PyTree, old: PyTree) -> PyTree:
+            return jax.tree.map(lambda n, o: jnp.where(lost, o, n), new, old)
+
         kept = state.replace(
-            observation=choose(lost, before.observation, state.observation),
+            observation=unless_lost(state.observation, before.observation),
             reward=jnp.where(lost, 0.0, state.reward),
             terminated=state.terminated & ~lost,
             truncated=(state.truncated | lost) & ~state.terminated | lost,
-            metrics=choose(lost, before.metrics, state.metrics),
+            metrics=unless_lost(state.metrics, before.metrics),
         )
         return kept, lost
 
     return step
-
-
-def choose(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
-    """Returns one of two trees, by a condition [] bool."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
 def example(env: Env) -> State:

@@ -8,9 +8,10 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from purerl.adapters.stepping import Drawer, check_length, choose, example, sound_step, to_numpy
+from purerl.adapters.stepping import Drawer, check_length, example, sound_step, to_numpy
 from purerl.core.env import Env, State
 from purerl.core.records import Array
+from purerl.ppo.rollout import select
 
 
 def spaces(env: Env) -> tuple[gymnasium.Space, gymnasium.Space]:
@@ -107,7 +108,7 @@ class GymnasiumVectorEnv(VectorEnv):
         self.action_space = batch_space(self.single_action_space, number)
         self._start = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, number)))
         self._step = jax.jit(jax.vmap(sound_step(env)))
-        self._choose = jax.jit(jax.vmap(choose))
+        self._choose = jax.jit(select)
 
     def reset(
         self, *, seed: int | None = None, options: dict | None = None
