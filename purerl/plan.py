@@ -86,8 +86,8 @@ def same(some: Any, others: Any) -> bool:
     import jax
     import numpy as np
 
-    alike = jax.tree.structure(some) == jax.tree.structure(others)
-    return alike and jax.tree.all(jax.tree.map(np.array_equal, some, others))
+    shapes: Any = [jax.tree.structure(tree) for tree in (some, others)]
+    return shapes[0] == shapes[1] and jax.tree.all(jax.tree.map(np.array_equal, some, others))
 
 
 main = main_of_words(command, show_help)

@@ -120,10 +120,7 @@ class HostEnv:
     def _call(self, function: Callable[..., np.ndarray], seed: Array, *rest: Array) -> State:
         shape = jax.ShapeDtypeStruct((self.pool.width,), np.float32)
         row = jax.pure_callback(function, shape, seed, *rest, vmap_method="broadcast_all")
-        return self._state(row, (seed, jnp.asarray(rest[0], jnp.int32)))
-
-    def _state(self, row: Array, task: tuple[Array, Array]) -> State:
-        """Returns our state from what the pool answers."""
+        task = (seed, jnp.asarray(rest[0], jnp.int32))
         reward, terminated, truncated = row[0], row[1] > 0.5, row[2] > 0.5
         end = 3 + self.pool.observed
         parts, at = {}, end

@@ -32,12 +32,23 @@ def new_key(rng: np.random.Generator) -> Array:
 
 
 class GymnasiumEnv(gymnasium.Env):
-    """One of our environments; `gymnasium_env` makes one."""
+    """One of our environments as a `gymnasium.Env`."""
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}
 
-    def __init__(self, env: Env, episode_length: int, render_mode: str | None) -> None:
-        """Compiles nothing yet."""
+    def __init__(
+        self, env: Env, episode_length: int = 1000, render_mode: str | None = None
+    ) -> None:
+        """Compiles nothing yet.
+
+        Args:
+          env: the environment.
+          episode_length: control steps until it is truncated.
+          render_mode: None or "rgb_array".
+
+        Raises:
+          UserError: no steps, or nothing to draw.
+        """
         self.env, self.episode_length = env, check_length(episode_length)
         self.observation_space, self.action_space = spaces(env)
         self.metadata = self.metadata | {"render_fps": round(1 / env.control_timestep)}
@@ -79,29 +90,22 @@ def _info(state: State) -> dict[str, Any]:
     return {name: float(x) for name, x in state.metrics.items()}
 
 
-def gymnasium_env(
-    env: Env, episode_length: int = 1000, render_mode: str | None = None
-) -> GymnasiumEnv:
-    """Returns one of our environments as a `gymnasium.Env`.
-
-    Args:
-      env: the environment.
-      episode_length: control steps until it is truncated.
-      render_mode: None or "rgb_array".
-
-    Raises:
-      UserError: no steps, or nothing to draw.
-    """
-    return GymnasiumEnv(env, episode_length, render_mode)
+gymnasium_env = GymnasiumEnv
 
 
 class GymnasiumVectorEnv(VectorEnv):
-    """Several of our environments in one program; `gymnasium_vector_env` makes one."""
+    """Our environments as a `gymnasium.vector.VectorEnv`, stepped together by one program."""
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}
 
-    def __init__(self, env: Env, number: int, episode_length: int) -> None:
-        """Compiles nothing yet."""
+    def __init__(self, env: Env, number: int, episode_length: int = 1000) -> None:
+        """Compiles nothing yet.
+
+        Args:
+          env: the environment.
+          number: B.
+          episode_length: control steps until one is truncated.
+        """
         self.num_envs, self.episode_length = number, check_length(episode_length)
         self.single_observation_space, self.single_action_space = spaces(env)
         self.observation_space = batch_space(self.single_observation_space, number)
@@ -141,12 +145,4 @@ class GymnasiumVectorEnv(VectorEnv):
         return to_numpy(self.state.metrics) | {"lost": lost}
 
 
-def gymnasium_vector_env(env: Env, number: int, episode_length: int = 1000) -> GymnasiumVectorEnv:
-    """Returns environments as a `gymnasium.vector.VectorEnv`, stepped together by one program.
-
-    Args:
-      env: the environment.
-      number: B.
-      episode_length: control steps until one is truncated.
-    """
-    return GymnasiumVectorEnv(env, number, episode_length)
+gymnasium_vector_env = GymnasiumVectorEnv

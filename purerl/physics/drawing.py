@@ -99,18 +99,14 @@ class Stage:
 def add_scenery(scene: mujoco.MjvScene, scenery: tuple[Array, ...]) -> None:
     """Adds a picture's boxes to a scene that MuJoCo has updated."""
     for center, half_size in zip(*scenery, strict=True) if scenery else ():
-        _add_box(scene, np.asarray(center, float), np.asarray(half_size, float))
-
-
-def _add_box(scene: mujoco.MjvScene, center: np.ndarray, half_size: np.ndarray) -> None:
-    if scene.ngeom >= scene.maxgeom:
-        return
-    # 2 mm smaller: where the model has the same box, its surface and not this one is seen.
-    half_size = np.maximum(half_size - 0.002, 1e-4)
-    geom, box = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_BOX
-    color = np.array([0.4, 0.45, 0.5, 1.0], np.float32)
-    mujoco.mjv_initGeom(geom, box, half_size, center, np.eye(3).ravel(), color)
-    scene.ngeom += 1
+        if scene.ngeom >= scene.maxgeom:
+            return
+        # 2 mm smaller: where the model has the same box, its surface and not this one is seen.
+        size = np.maximum(np.asarray(half_size, float) - 0.002, 1e-4)
+        geom, box = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_BOX
+        color, upright = np.array([0.4, 0.45, 0.5, 1.0], np.float32), np.eye(3).ravel()
+        mujoco.mjv_initGeom(geom, box, size, np.asarray(center, float), upright, color)
+        scene.ngeom += 1
 
 
 def default_camera(model: mujoco.MjModel) -> int | None:

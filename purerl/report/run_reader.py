@@ -49,7 +49,8 @@ class RunRecord(NamedTuple):
     def curve(self, metric: str) -> dict[int, float]:
         """Returns steps -> value wherever the metric was measured and finite."""
         found = {line["steps"]: line.get(metric) for line in self.lines}
-        return {steps: float(v) for steps, v in found.items() if v is not None and _is_finite(v)}
+        most = sys.float_info.max  # of a float; JSON's integers have no end
+        return {n: float(v) for n, v in found.items() if v is not None and abs(v) <= most}
 
 
 def find_runs(arguments: Iterable[Path]) -> list[Path]:
@@ -113,11 +114,6 @@ def _check_line(where: str, line: dict[str, Any]) -> dict[str, Any]:
         if not 0 <= line[name] <= sys.maxsize:
             raise UserError(f"{where}: {name} is {line[name]}; it must be from 0 to {sys.maxsize}.")
     return line
-
-
-def _is_finite(value: float) -> bool:
-    """Tells whether a number is one that a float holds: JSON's integers have no end."""
-    return abs(value) <= sys.float_info.max
 
 
 def flatten(value: Any, path: str = "") -> dict[str, Any]:

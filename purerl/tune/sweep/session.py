@@ -77,7 +77,7 @@ def _begin(sweep: Sweep) -> Iterator[None]:
         if not file.exists() and any(not one.name.startswith(".") for one in folder.iterdir()):
             raise UserError(f"{folder} holds no sweep, but other files; use another --name.")
         lock = _lock(folder)
-    try:
+    with contextlib.closing(lock):
         described = _describe(sweep)
         if file.exists():
             # An older version wrote less down, and goes on.
@@ -86,8 +86,6 @@ def _begin(sweep: Sweep) -> Iterator[None]:
             _check_code(sweep.base, begun["source"], described["source"])
         write_json(file, described)
         yield
-    finally:
-        lock.close()
 
 
 def _lock(folder: Path) -> FolderLock:
