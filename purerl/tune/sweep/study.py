@@ -37,11 +37,8 @@ def open_study(folder: Path | None) -> Any:
 def known(study: Any, spaces: Sequence[Space]) -> list[Point]:
     """Returns the points chosen so far; one that a kill left half chosen is none."""
     names = {space.setting for space in spaces}
-    return [
-        Point(trial.number, {space.setting: _text(space, trial.params) for space in spaces})
-        for trial in study.get_trials(deepcopy=False)
-        if names == trial.params.keys()
-    ]
+    trials = study.get_trials(deepcopy=False)
+    return [_point(trial, spaces) for trial in trials if names == trial.params.keys()]
 
 
 def propose(study: Any, spaces: Sequence[Space], number: int) -> Iterator[Point]:
@@ -54,7 +51,7 @@ def propose(study: Any, spaces: Sequence[Space], number: int) -> Iterator[Point]
     while len(known(study, spaces)) < number:
         study.sampler = _sampler(len(study.get_trials(deepcopy=False)))
         trial = study.ask({space.setting: _distribution(space) for space in spaces})
-        yield Point(trial.number, {s.setting: _text(s, trial.params) for s in spaces})
+        yield _point(trial, spaces)
 
 
 def tell(study: Any, point: Point, score: float) -> None:
@@ -84,5 +81,6 @@ def _distribution(space: Space) -> Any:
     return known.FloatDistribution(space.low, space.high, log=space.log)
 
 
-def _text(space: Space, params: dict[str, Any]) -> str:
-    return str(params[space.setting])  # of a float every digit
+def _point(trial: Any, spaces: Sequence[Space]) -> Point:
+    # Of a float every digit.
+    return Point(trial.number, {s.setting: str(trial.params[s.setting]) for s in spaces})
