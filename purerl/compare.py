@@ -7,7 +7,6 @@ differences on the same seeds, learning curves.
 Exit codes: 0 compared; 1 two runs that promise the same bits have not; 2 a mistake in the command.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +14,7 @@ from typing import Annotated
 import tyro
 
 from purerl.core.errors import FAILURE, SUCCESS, UserError
-from purerl.experiment.command_line import carry_out
+from purerl.experiment.command_line import main_of
 from purerl.machine.command_errors import leave
 from purerl.machine.output import show
 
@@ -39,11 +38,6 @@ class CompareOptions:
     """Folder for compare.json, groups.csv, curves.csv and curves.png."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    return carry_out(CompareOptions, command, "python -m purerl.compare", arguments)
-
-
 def command(options: CompareOptions) -> int:
     """Compares, prints and writes what was asked for; returns the exit code."""
     from purerl.report import comparison
@@ -56,6 +50,9 @@ def command(options: CompareOptions) -> int:
         comparison.write(options.out, result, curves)
     broken = any(pair["same"] is False and pair["promised"] for pair in result["pairs"])
     return FAILURE if broken else SUCCESS
+
+
+main = main_of(CompareOptions, command, "python -m purerl.compare")
 
 
 if __name__ == "__main__":

@@ -4,12 +4,11 @@ RUN is a run's folder; nothing else is needed, and nothing in it is changed.
 """
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from purerl.experiment.command_line import carry_out
+from purerl.experiment.command_line import main_of
 from purerl.experiment.options import PlayOptions
 from purerl.machine.command_errors import leave
 from purerl.machine.files import check_writable, write_answer
@@ -29,11 +28,6 @@ class EvaluateOptions(PlayOptions):
     """Sample actions instead of taking the distribution's centre."""
     json: Path | None = None
     """Also write the result to this file as JSON, every episode's figures included."""
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    return carry_out(EvaluateOptions, command, "python -m purerl.evaluate", arguments)
 
 
 def command(options: EvaluateOptions) -> None:
@@ -63,6 +57,9 @@ def describe(result: "Evaluated") -> list[str]:
             for name, s in ordered.items()
         ),
     ]
+
+
+main = main_of(EvaluateOptions, command, "python -m purerl.evaluate")
 
 
 if __name__ == "__main__":

@@ -11,14 +11,13 @@ actions are from the run's own is printed.
 
 import importlib
 import importlib.util
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import purerl
 from purerl.core.errors import UserError
-from purerl.experiment.command_line import carry_out
+from purerl.experiment.command_line import main_of
 from purerl.experiment.options import PlayOptions
 from purerl.machine.command_errors import leave
 from purerl.machine.files import check_writable
@@ -35,11 +34,6 @@ class ExportOptions(PlayOptions):  # noqa: D101 (--help prints the page above)
     """Kind of file."""
     out: Path | None = None
     """File to write (default: policy.npz, policy.jax or policy.onnx)."""
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    return carry_out(ExportOptions, command, "python -m purerl.export", arguments)
 
 
 def command(options: ExportOptions) -> None:
@@ -64,6 +58,9 @@ def writer(name: str) -> Any:
             f"--format {name} needs {', '.join(missing)}: {purerl.how_to_install('export')}"
         )
     return getattr(importlib.import_module(f"purerl.report.policy_{name}"), f"write_{name}")
+
+
+main = main_of(ExportOptions, command, "python -m purerl.export")
 
 
 if __name__ == "__main__":

@@ -8,14 +8,13 @@ The folder NAME needs no place in the clone. It trains at once, and its comments
 """
 
 import shlex
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from purerl.experiment.command_line import carry_out
+from purerl.experiment.command_line import main_of
 from purerl.machine.command_errors import leave
 from purerl.machine.output import show
 
@@ -28,11 +27,6 @@ class NewOptions:
     """The folder to make, here or by its path; its last part is a Python name, such as my_robot."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    return carry_out(NewOptions, command, "python -m purerl.new", arguments)
-
-
 def command(options: NewOptions) -> None:
     """Writes the files, and says how to go on."""
     from purerl.experiment.new_project import write_project
@@ -40,6 +34,9 @@ def command(options: NewOptions) -> None:
     show(*map(str, write_project(options.name)), "", f"cd {shlex.quote(str(options.name))}")
     show("python -m purerl.check experiment.py    # what can be checked before training")
     show("python -m purerl.run experiment.py      # trains it")
+
+
+main = main_of(NewOptions, command, "python -m purerl.new")
 
 
 if __name__ == "__main__":

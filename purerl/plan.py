@@ -14,18 +14,19 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
+from purerl.experiment.command_line import main_of_words
 from purerl.machine import output
 from purerl.machine.command_errors import leave
 
 PROG = "python -m purerl.plan"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
+def show_help(words: Sequence[str]) -> None:
+    """Prints the help page."""
+    from purerl.tune import subject
     from purerl.tune.plan.problem import PlanCommandOptions
-    from purerl.tune.subject import carry_out_on_subject
 
-    return carry_out_on_subject(command, PlanCommandOptions, __doc__, PROG, arguments)
+    subject.show_help(PlanCommandOptions, __doc__, PROG, words)
 
 
 def command(words: Sequence[str]) -> None:
@@ -85,10 +86,11 @@ def same(some: Any, others: Any) -> bool:
     import jax
     import numpy as np
 
-    ours, theirs = (dict(jax.tree_util.tree_leaves_with_path(x)) for x in (some, others))
-    return ours.keys() == theirs.keys() and all(
-        np.array_equal(ours[name], theirs[name]) for name in ours
-    )
+    shapes: Any = [jax.tree.structure(tree) for tree in (some, others)]
+    return shapes[0] == shapes[1] and jax.tree.all(jax.tree.map(np.array_equal, some, others))
+
+
+main = main_of_words(command, show_help)
 
 
 if __name__ == "__main__":

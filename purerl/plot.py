@@ -4,7 +4,6 @@ In the terminal, as wide as that is, by plain characters; with --out also as a p
 """
 
 import shutil
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from purerl.core.errors import UserError
-from purerl.experiment.command_line import carry_out
+from purerl.experiment.command_line import main_of
 from purerl.machine.command_errors import leave
 from purerl.machine.output import show
 
@@ -27,11 +26,6 @@ class PlotOptions:
     """What to plot, against control steps."""
     out: Path | None = None
     """Also write a picture (PNG): groups as in compare, their interquartile means, their runs."""
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    return carry_out(PlotOptions, command, "python -m purerl.plot", arguments)
 
 
 def command(options: PlotOptions) -> None:
@@ -52,11 +46,11 @@ def command(options: PlotOptions) -> None:
     columns, rows = shutil.get_terminal_size((100, 30))
     show(*draw(curves, options.metric, columns, min(rows - 6, 24)))
     if options.out is not None:
-        try:
-            comparison.draw_curves(options.out, curves, options.metric)
-        except OSError as error:
-            raise UserError(f"{options.out} cannot be written: {error.strerror}.") from error
+        comparison.draw_curves(options.out, curves, options.metric)
         show(str(options.out))
+
+
+main = main_of(PlotOptions, command, "python -m purerl.plot")
 
 
 if __name__ == "__main__":

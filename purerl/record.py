@@ -22,12 +22,11 @@ returns from `reward` here. Every array but `length` is [N, T, ...]: N episodes 
 MuJoCo's model, to compute from `qpos` where limbs are, is `purerl.load(RUN).env.physics.model`.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from purerl.core.errors import UserError
-from purerl.experiment.command_line import carry_out
+from purerl.core.errors import UserError, check_least
+from purerl.experiment.command_line import main_of
 from purerl.experiment.options import PlayOptions
 from purerl.machine.command_errors import leave
 from purerl.machine.files import check_writable, write_arrays
@@ -44,23 +43,20 @@ class RecordOptions(PlayOptions):  # noqa: D101 (--help prints the page above)
     """Whole episodes, N."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    return carry_out(RecordOptions, command, "python -m purerl.record", arguments)
-
-
 def command(options: RecordOptions) -> None:
     """Writes the file and tells what is in it."""
     from purerl.report.episode_arrays import record
     from purerl.runs.loaded_run import load
 
-    if options.episodes < 1:
-        raise UserError(f"episodes is {options.episodes}; it must be at least 1.")
+    check_least(options, UserError, episodes=1)
     check_writable(options.out)
     run = load(options.run, options.checkpoint, options.engine, options.trust)
     arrays = record(run.restored.setup, run.state, options.seed, options.episodes)
     write_arrays(options.out, arrays)
     show(*(f"{name:32} {x.dtype} {list(x.shape)}" for name, x in arrays.items()), str(options.out))
+
+
+main = main_of(RecordOptions, command, "python -m purerl.record")
 
 
 if __name__ == "__main__":

@@ -5,11 +5,10 @@ episode's own geometry; <update>.png beside it shows 16 moments of it. No screen
 """
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-from purerl.core.errors import UserError
-from purerl.experiment.command_line import carry_out
+from purerl.core.errors import UserError, check_least
+from purerl.experiment.command_line import main_of
 from purerl.experiment.options import PlayOptions
 from purerl.machine.command_errors import leave
 from purerl.machine.output import show
@@ -29,11 +28,6 @@ class RenderOptions(PlayOptions):
     """Width x height of a frame [pixels], both even."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    return carry_out(RenderOptions, command, "python -m purerl.render", arguments)
-
-
 def command(options: RenderOptions) -> None:
     """Makes the video, and prints which files it made."""
     show(*make(options))
@@ -44,9 +38,7 @@ def make(options: RenderOptions) -> list[str]:
     from purerl.report.opengl import open_gl
 
     size = _parse_size(options.size)
-    for name, least in (("episodes", 1), ("seconds", 0.1)):
-        if not getattr(options, name) >= least:
-            raise UserError(f"{name} is {getattr(options, name)}; it must be at least {least}.")
+    check_least(options, UserError, episodes=1, seconds=0.1)
     # First of all: what follows imports mujoco, which looks for OpenGL itself.
     open_gl(*size).free()
 
@@ -70,6 +62,9 @@ def _parse_size(size: str) -> tuple[int, int]:
             f"size is {size}; width and height must be even and from 16 to 4096 pixels."
         )
     return width, height
+
+
+main = main_of(RenderOptions, command, "python -m purerl.render")
 
 
 if __name__ == "__main__":

@@ -19,56 +19,44 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from purerl.core.errors import USAGE, RunError, StoppedError, UserError, one_line
+from purerl.core.errors import SUCCESS, StoppedError, one_line
 from purerl.experiment import loading
+from purerl.experiment.command_line import main_of_words, read_experiment
 from purerl.machine import output
 from purerl.machine.command_errors import leave, tell
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
-    if not arguments or arguments[0] in ("-h", "--help"):
-        output.show(*_help_page())
-        return 0 if arguments else USAGE
-    code = 0
-    try:
-        _command(arguments)
-    except (UserError, RunError, StoppedError) as error:
-        code = tell(error)
-        if isinstance(error, StoppedError):
-            more = [] if "--resume" in arguments else ["--resume"]
-            again = shlex.join(["python", "-m", "purerl.run", *arguments, *more])
-            output.warn(f"Go on with: {again}")
-    output.flush_or_drop(sys.stdout)
-    return code
-
-
-def _help_page() -> list[str]:
-    """Returns the page of `python -m purerl.run --help`, without importing JAX."""
+def show_help(words: Sequence[str]) -> None:
+    """Prints the help page, without importing JAX."""
     lines = [*str(__doc__).split("\n"), "Experiments:"]
     named = loading.available()
     width = max(map(len, named), default=0)
     lines += [f"  {name:{width}}  {loading.summary(path)}" for name, path in named.items()]
-    return lines if named else [*lines, "  none in experiments/"]
+    output.show(*lines, *([] if named else ["  none in experiments/"]))
 
 
-def _command(arguments: Sequence[str]) -> None:
+def command(words: Sequence[str]) -> int:
+    """Trains; tells how to go on where it was stopped."""
+    try:
+        _train(words)
+    except StoppedError as error:
+        code = tell(error)
+        more = [] if "--resume" in words else ["--resume"]
+        output.warn(f"Go on with: {shlex.join(['python', '-m', 'purerl.run', *words, *more])}")
+        return code
+    finally:
+        output.flush_or_drop(sys.stdout)
+    return SUCCESS
+
+
+def _train(words: Sequence[str]) -> None:
     """Parses, trains, and with --video shows the policy of the first seed."""
     from purerl import render
-    from purerl.experiment.command_line import from_command_line
     from purerl.report.opengl import choose_gl
     from purerl.training import train
 
     train.set_xla_flags_in_time()
-    if arguments[0].startswith("-"):
-        raise UserError(
-            f"The first word must be the experiment, not {arguments[0]!r}: "
-            "python -m purerl.run EXPERIMENT [--option value ...]"
-        )
-    source = loading.find_source(arguments[0])
-    prog = f"python -m purerl.run {arguments[0]}"
-    chosen, options = from_command_line(source, arguments[1:], prog)
+    source, chosen, options = read_experiment(words, "python -m purerl.run")
     # Before mujoco is imported, which looks for OpenGL itself.
     video = options.video and _attempt("video", choose_gl)
     folders = train.train_runs(source, chosen, options, os._exit)
@@ -77,13 +65,12 @@ def _command(arguments: Sequence[str]) -> None:
 
         if is_first():
             shown = render.RenderOptions(folders[0], trust=True)
-            files: list[str] = []
-            if _attempt("video", _show_policy, shown, files):
-                _attempt("video for the loggers", _log_video, options, folders[0], files[-1])
+            if file := _attempt("video", _show_policy, shown):
+                _attempt("video for the loggers", _log_video, options, folders[0], Path(file))
 
 
-def _show_policy(options: Any, files: list[str]) -> None:
-    """Makes a video, and adds its path to `files`.
+def _show_policy(options: Any) -> str:
+    """Makes a video; returns its path.
 
     Training has ended, and nothing that cannot be printed is a failure of it.
     """
@@ -91,26 +78,27 @@ def _show_policy(options: Any, files: list[str]) -> None:
 
     for line in (lines := render.make(options)):
         output.say(line)
-    files.append(lines[-1])
+    return lines[-1]
 
 
-def _log_video(options: Any, folder: Path, video: str) -> None:
+def _log_video(options: Any, folder: Path, video: Path) -> None:
     """Hands the video to TensorBoard and W&B, if the run has them."""
     from purerl.report.video_loggers import log_video
 
-    path = Path(video)
-    for line in log_video(options, folder, path, int(path.stem.partition("_")[0])):
+    for line in log_video(options, folder, video, int(video.stem.partition("_")[0])):
         output.say(line)
 
 
-def _attempt(what: str, part: Callable[..., Any], *arguments: Any) -> bool:
-    """Calls a part of making a video; a failure is one line, and changes no exit code."""
+def _attempt(what: str, part: Callable[..., Any], *arguments: Any) -> Any:
+    """Returns what a part of making a video does; a failure is a line, and changes no exit code."""
     try:
-        part(*arguments)
+        return part(*arguments)
     except Exception as error:
         output.warn(f"purerl: There is no {what}: {one_line(error)}")
-        return False
-    return True
+        return None
+
+
+main = main_of_words(command, show_help)
 
 
 if __name__ == "__main__":

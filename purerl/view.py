@@ -8,6 +8,7 @@ planner. Sliders change the numbers of the environment's options, which begin as
 A run's folder is only read, and may be training meanwhile.
 """
 
+import functools
 import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,9 +16,10 @@ from typing import Literal
 
 import purerl
 from purerl.core.errors import UserError
+from purerl.experiment.command_line import main_of_words
 from purerl.machine.command_errors import leave
 from purerl.machine.output import show
-from purerl.tune.subject import PlanOptions, carry_out_on_subject, chosen as settings_of, find
+from purerl.tune.subject import PlanOptions, chosen as settings_of, find, show_help
 
 PROG = "python -m purerl.view"
 
@@ -34,11 +36,6 @@ class ViewOptions(PlanOptions):
     ssh -L 8080:127.0.0.1:8080 MACHINE."""
     port: int = 8080
     """The port to listen on."""
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    return carry_out_on_subject(command, ViewOptions, __doc__, PROG, arguments)
 
 
 def has_viser() -> bool:
@@ -68,6 +65,9 @@ def command(words: Sequence[str]) -> None:
         show("Closed.")
     finally:
         page.close()
+
+
+main = main_of_words(command, functools.partial(show_help, ViewOptions, __doc__, PROG))
 
 
 if __name__ == "__main__":

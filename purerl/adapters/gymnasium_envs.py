@@ -7,6 +7,7 @@ anew. The run's plan says so.
 """
 
 import difflib
+import functools
 import sys
 import threading
 from collections import OrderedDict
@@ -119,10 +120,7 @@ class HostEnv:
     def _call(self, function: Callable[..., np.ndarray], seed: Array, *rest: Array) -> State:
         shape = jax.ShapeDtypeStruct((self.pool.width,), np.float32)
         row = jax.pure_callback(function, shape, seed, *rest, vmap_method="broadcast_all")
-        return self._state(row, (seed, jnp.asarray(rest[0], jnp.int32)))
-
-    def _state(self, row: Array, task: tuple[Array, Array]) -> State:
-        """Returns our state from what the pool answers."""
+        task = (seed, jnp.asarray(rest[0], jnp.int32))
         reward, terminated, truncated = row[0], row[1] > 0.5, row[2] > 0.5
         end = 3 + self.pool.observed
         parts, at = {}, end
@@ -153,12 +151,10 @@ class _Episode:
 
 def warned_once(make: Callable[[], gymnasium.Env]) -> Callable[[], gymnasium.Env]:
     """Returns `make`, of which MuJoCo says each warning once: each episode compiles its XML."""
-    told: set[str] = set()
 
+    @functools.cache
     def tell(text: str) -> None:
-        if text not in told:
-            told.add(text)
-            print(f"MuJoCo: {text.strip()}", file=sys.stderr)
+        print(f"MuJoCo: {text.strip()}", file=sys.stderr)
 
     def made() -> gymnasium.Env:
         mujoco.set_mju_user_warning(tell)

@@ -12,10 +12,16 @@ from purerl.core.env import Env
 
 
 class DmEnvironment(dm_env.Environment):
-    """One of our environments; `dm_env_environment` makes one."""
+    """One of our environments as a `dm_env.Environment`."""
 
-    def __init__(self, env: Env, episode_length: int, seed: int) -> None:
-        """Compiles nothing yet."""
+    def __init__(self, env: Env, episode_length: int = 1000, seed: int = 0) -> None:
+        """Compiles nothing yet.
+
+        Args:
+          env: the environment.
+          episode_length: control steps until it is truncated (a last step with discount 1).
+          seed: of the episodes' starts.
+        """
         self.env, self.episode_length = env, check_length(episode_length)
         self._key, self._episodes = jax.random.key(seed), 0
         self._shapes = example(env).observation
@@ -58,12 +64,4 @@ class DmEnvironment(dm_env.Environment):
         return specs.BoundedArray((self.env.action_size,), np.float32, -1.0, 1.0, "action")
 
 
-def dm_env_environment(env: Env, episode_length: int = 1000, seed: int = 0) -> DmEnvironment:
-    """Returns one of our environments as a `dm_env.Environment`.
-
-    Args:
-      env: the environment.
-      episode_length: control steps until it is truncated (a last step with discount 1).
-      seed: of the episodes' starts.
-    """
-    return DmEnvironment(env, episode_length, seed)
+dm_env_environment = DmEnvironment

@@ -4,14 +4,14 @@ from typing import Any
 
 import gymnasium
 import jax
-import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from purerl.adapters.stepping import Drawer, check_length, example, sound_step, to_numpy
 from purerl.core.env import Env, State
-from purerl.core.records import Array, PyTree
+from purerl.core.records import Array
+from purerl.ppo.rollout import select
 
 
 def spaces(env: Env) -> tuple[gymnasium.Space, gymnasium.Space]:
@@ -32,12 +32,23 @@ def new_key(rng: np.random.Generator) -> Array:
 
 
 class GymnasiumEnv(gymnasium.Env):
-    """One of our environments; `gymnasium_env` makes one."""
+    """One of our environments as a `gymnasium.Env`."""
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}
 
-    def __init__(self, env: Env, episode_length: int, render_mode: str | None) -> None:
-        """Compiles nothing yet."""
+    def __init__(
+        self, env: Env, episode_length: int = 1000, render_mode: str | None = None
+    ) -> None:
+        """Compiles nothing yet.
+
+        Args:
+          env: the environment.
+          episode_length: control steps until it is truncated.
+          render_mode: None or "rgb_array".
+
+        Raises:
+          UserError: no steps, or nothing to draw.
+        """
         self.env, self.episode_length = env, check_length(episode_length)
         self.observation_space, self.action_space = spaces(env)
         self.metadata = self.metadata | {"render_fps": round(1 / env.control_timestep)}
@@ -79,36 +90,29 @@ def _info(state: State) -> dict[str, Any]:
     return {name: float(x) for name, x in state.metrics.items()}
 
 
-def gymnasium_env(
-    env: Env, episode_length: int = 1000, render_mode: str | None = None
-) -> GymnasiumEnv:
-    """Returns one of our environments as a `gymnasium.Env`.
-
-    Args:
-      env: the environment.
-      episode_length: control steps until it is truncated.
-      render_mode: None or "rgb_array".
-
-    Raises:
-      UserError: no steps, or nothing to draw.
-    """
-    return GymnasiumEnv(env, episode_length, render_mode)
+gymnasium_env = GymnasiumEnv
 
 
 class GymnasiumVectorEnv(VectorEnv):
-    """Several of our environments in one program; `gymnasium_vector_env` makes one."""
+    """Our environments as a `gymnasium.vector.VectorEnv`, stepped together by one program."""
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}
 
-    def __init__(self, env: Env, number: int, episode_length: int) -> None:
-        """Compiles nothing yet."""
+    def __init__(self, env: Env, number: int, episode_length: int = 1000) -> None:
+        """Compiles nothing yet.
+
+        Args:
+          env: the environment.
+          number: B.
+          episode_length: control steps until one is truncated.
+        """
         self.num_envs, self.episode_length = number, check_length(episode_length)
         self.single_observation_space, self.single_action_space = spaces(env)
         self.observation_space = batch_space(self.single_observation_space, number)
         self.action_space = batch_space(self.single_action_space, number)
         self._start = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, number)))
         self._step = jax.jit(jax.vmap(sound_step(env)))
-        self._replace = jax.jit(_replace)
+        self._choose = jax.jit(select)
 
     def reset(
         self, *, seed: int | None = None, options: dict | None = None
@@ -126,7 +130,7 @@ class GymnasiumVectorEnv(VectorEnv):
         stepped, lost = self._step(self.state, np.asarray(actions, np.float32))
         if begun.any():
             fresh = self._start(new_key(self.np_random))
-            stepped = self._replace(begun, fresh, stepped)
+            stepped = self._choose(begun, fresh, stepped)
         self.state = stepped
         self.steps = np.where(begun, 0, self.steps + 1)
         terminated = np.array(stepped.terminated)
@@ -141,19 +145,4 @@ class GymnasiumVectorEnv(VectorEnv):
         return to_numpy(self.state.metrics) | {"lost": lost}
 
 
-def _replace(condition: Array, new: PyTree, old: PyTree) -> PyTree:
-    def one(a: Array, b: Array) -> Array:
-        return jnp.where(jnp.expand_dims(condition, tuple(range(1, b.ndim))), a, b)
-
-    return jax.tree.map(one, new, old)
-
-
-def gymnasium_vector_env(env: Env, number: int, episode_length: int = 1000) -> GymnasiumVectorEnv:
-    """Returns environments as a `gymnasium.vector.VectorEnv`, stepped together by one program.
-
-    Args:
-      env: the environment.
-      number: B.
-      episode_length: control steps until one is truncated.
-    """
-    return GymnasiumVectorEnv(env, number, episode_length)
+gymnasium_vector_env = GymnasiumVectorEnv

@@ -21,7 +21,6 @@ from purerl.checks.user_code import in_words, own_line
 from purerl.checks.watch_physics import check_controls, check_placed
 from purerl.core.env import ABSURD, Env, EnvError, State
 from purerl.core.errors import one_line
-from purerl.core.records import PyTree
 from purerl.machine.state_arrays import flatten
 
 NUM_ENVS, NUM_STEPS = 16, 20
@@ -218,7 +217,9 @@ def check_actions(trial: Trial) -> Finding:
     flips = np.ones((number, size), np.float32)
     flips[1 + np.arange(size), np.arange(size)] = -1.0
     actions = jnp.repeat(trial.actions[:, :1], number, 1) * flips
-    later = _felt(trial.rollout(same, actions)[1])
+    states = trial.rollout(same, actions)[1]
+    # Not the reward, which may just take the action's cost.
+    later = flatten((states.physics, states.observation, states.terminated))
     idle = [
         str(i)
         for i in range(size)
@@ -228,8 +229,3 @@ def check_actions(trial: Trial) -> Finding:
         what = f"entries {some(idle)} of {size} change nothing in {steps} steps"
         return warning("actions", f"{what}: is every entry used, and every actuator connected?")
     return ok("actions", f"each of {size} has an effect")
-
-
-def _felt(states: PyTree) -> dict[str, np.ndarray]:
-    """Returns what an action may change, beside the reward, which may just take its cost."""
-    return flatten((states.physics, states.observation, states.terminated))

@@ -32,7 +32,8 @@ def examine(network: Network, observation: PyTree) -> Iterator[Finding]:
     _, scale, value = answers[0]
     broken = [n for n, x in zip(("loc", "scale", "value"), answers[0], strict=True) if _bad(x)]
     if broken:
-        what = f"{_are(broken)} not finite for observations of mean 0, std 1."
+        verb = "is" if len(broken) == 1 else "are"
+        what = f"{some(broken)} {verb} not finite for observations of mean 0, std 1."
         yield error("outputs", what)
         return
     if not (np.asarray(scale) > 0).all():
@@ -55,10 +56,6 @@ def _moved(params: PyTree) -> PyTree:
     pairs = zip(keys, leaves, strict=True)
     moved = [x + STEP * jax.random.normal(k, x.shape, x.dtype) for k, x in pairs]
     return jax.tree.unflatten(tree, moved)
-
-
-def _are(names: list[str]) -> str:
-    return f"{some(names)} {'is' if len(names) == 1 else 'are'}"
 
 
 def _normalize(x: Array) -> Array:

@@ -1,5 +1,6 @@
 """What checks found: a line each."""
 
+import functools
 from typing import NamedTuple
 
 
@@ -15,19 +16,9 @@ class Finding(NamedTuple):
         return f"{self.level:8} {self.about:12} {self.text}"
 
 
-def ok(about: str, text: str) -> Finding:
-    """Nothing to mend."""
-    return Finding("ok", about, text)
-
-
-def warning(about: str, text: str) -> Finding:
-    """It trains, but probably not as it is meant to."""
-    return Finding("warning", about, text)
-
-
-def error(about: str, text: str) -> Finding:
-    """It breaks a rule, or cannot learn."""
-    return Finding("error", about, text)
+ok = functools.partial(Finding, "ok")  # nothing to mend
+warning = functools.partial(Finding, "warning")  # it trains, but probably not as it is meant to
+error = functools.partial(Finding, "error")  # it breaks a rule, or cannot learn
 
 
 def some(names: list[str], most: int = 6) -> str:

@@ -3,6 +3,7 @@
 import difflib
 import re
 from collections.abc import Iterable
+from typing import Any
 
 SUCCESS = 0
 FAILURE = 1  # the run could not go on: non-finite numbers, a disk that refuses the last checkpoint
@@ -66,6 +67,13 @@ def unknown_name(kind: str, name: str, valid: Iterable[str], where: str = "") ->
     near = nearest(str(name), valid)
     hint = f" Did you mean {near!r}?" if near else ""
     return f"There is no {kind} {name!r}{where}.{hint} There are: {', '.join(valid) or 'none'}."
+
+
+def check_least(owner: Any, refusal: type[Exception], **least: float) -> None:
+    """Raises a `refusal` that names the first of an object's numbers that is below its least."""
+    for name, number in least.items():
+        if not getattr(owner, name) >= number:
+            raise refusal(f"{name} is {getattr(owner, name)}; it must be at least {number}.")
 
 
 def one_line(error: BaseException) -> str:

@@ -11,10 +11,10 @@ from typing import Any
 
 import tyro
 
-from purerl.core.errors import SUCCESS, RunError, UserError, nearest
+from purerl.core.errors import SUCCESS, USAGE, RunError, StoppedError, UserError, nearest
 from purerl.experiment import other_trainers, settings_json
 from purerl.experiment.definition import Experiment, shrunk
-from purerl.experiment.loading import Source, available, summary
+from purerl.experiment.loading import Source, available, find_source, summary
 from purerl.experiment.options import RunOptions
 from purerl.machine import output
 from purerl.machine.command_errors import tell
@@ -24,22 +24,67 @@ CONFIG = (tyro.conf.FlagCreatePairsOff,)
 WORDS = (tyro.conf.FlagConversionOff,)
 
 
-def carry_out(
-    kind: Any, command: Callable[[Any], int | None], prog: str, arguments: Sequence[str] | None
-) -> int:
-    """Runs a command with its options; returns the exit code, an error being told in one line.
+def main_of(kind: Any, command: Callable[[Any], int | None], prog: str) -> Callable[..., int]:
+    """Returns a command's `main`, which tells an error in one line.
 
     Args:
       kind: the dataclass of its options.
       command: called with them; what it returns is the exit code, None: 0.
       prog: the command's words, for the help page.
-      arguments: the command line; None: this process's.
     """
-    try:
-        words = sys.argv[1:] if arguments is None else arguments
-        return command(parse(kind, words, prog)) or SUCCESS
-    except (UserError, RunError) as error:
-        return tell(error)
+
+    return _main(lambda words: command(parse(kind, words, prog)))
+
+
+def main_of_words(
+    command: Callable[[list[str]], int | None], show_help: Callable[[list[str]], Any]
+) -> Callable[..., int]:
+    """Returns the `main` of a command whose first word says what it is about, or asks for help.
+
+    Args:
+      command: called with the words; what it returns is the exit code, None: 0.
+      show_help: called with them where there is none, or the first asks for it.
+    """
+
+    def run(words: list[str]) -> int | None:
+        if words and words[0] not in ("-h", "--help"):
+            return command(words)
+        show_help(words)
+        return SUCCESS if words else USAGE
+
+    return _main(run)
+
+
+def _main(run: Callable[[list[str]], int | None]) -> Callable[..., int]:
+    def main(arguments: Sequence[str] | None = None) -> int:
+        try:
+            return run(sys.argv[1:] if arguments is None else list(arguments)) or SUCCESS
+        except (UserError, RunError, StoppedError) as error:
+            return tell(error)
+
+    return main
+
+
+def read_experiment(
+    words: Sequence[str], prog: str, base: Any = RunOptions
+) -> tuple[Source, Experiment, Any]:
+    """Returns the experiment that the first word names, and what the others make of it.
+
+    Args:
+      words: the command line.
+      prog: the command before it.
+      base: the dataclass of the command's options.
+
+    Raises:
+      UserError: there is no such experiment or option, or a value is wrong.
+    """
+    if words[0].startswith("-"):
+        raise UserError(
+            f"The first word must be the experiment, not {words[0]!r}: {prog} EXPERIMENT "
+            "[--option value ...]"
+        )
+    source = find_source(words[0])
+    return source, *from_command_line(source, words[1:], f"{prog} {words[0]}", base=base)
 
 
 def from_command_line(
@@ -127,9 +172,16 @@ def _words(name: str, value: Any) -> list[str]:
 
 
 def parse(
-    kind: Any, arguments: Sequence[str], prog: str, default: Any = None, config: Any = CONFIG
+    kind: Any,
+    arguments: Sequence[str],
+    prog: str,
+    default: Any = None,
+    config: Any = CONFIG,
+    **more: Any,
 ) -> Any:
     """Parses a command line into the dataclass `kind`; `--help` prints a page and exits.
+
+    `more` is for `tyro.cli`, such as `return_unknown_args=True`.
 
     Raises:
       UserError: there is no such option (the message has the nearest one), or a value is wrong.
@@ -138,7 +190,7 @@ def parse(
     extra = {} if default is None else {"default": default}
     try:
         with output.answering(), contextlib.redirect_stderr(said):
-            return tyro.cli(kind, args=list(arguments), prog=prog, config=config, **extra)
+            return tyro.cli(kind, args=list(arguments), prog=prog, config=config, **extra, **more)
     except SystemExit as error:
         if not error.code:
             raise

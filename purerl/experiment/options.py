@@ -6,7 +6,7 @@ from typing import Annotated, Literal, TypedDict
 
 import tyro
 
-from purerl.core.errors import UserError
+from purerl.core.errors import UserError, check_least
 
 Engine = Literal["auto", "c", "jax", "warp"]
 
@@ -85,10 +85,8 @@ class RunOptions:
 
     def __post_init__(self) -> None:
         """Checks the rules."""
-        lowest = {"num_seeds": 1, "num_shards": 0, "log_every": 0, "checkpoints": 0, "keep": 1}
-        for name, least in lowest.items():
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}.")
+        least = {"num_seeds": 1, "num_shards": 0, "log_every": 0, "checkpoints": 0, "keep": 1}
+        check_least(self, ValueError, **least)
 
     @property
     def vmapped_seeds(self) -> int:

@@ -119,6 +119,15 @@ def reason(error: BaseException) -> str:
 # --- writing ---
 
 
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turns a disk's refusal of what is written to `path` into a UserError."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"{path} cannot be written: {error.strerror}.") from error
+
+
 def write_json(path: Path, value: dict[str, Any]) -> None:
     """Writes a JSON file; UserError if the disk refuses."""
     write_file(path, (json.dumps(value, indent=2) + "\n").encode())
@@ -127,13 +136,11 @@ def write_json(path: Path, value: dict[str, Any]) -> None:
 def write_file(path: Path, content: bytes) -> None:
     """Writes a file whole or not at all; UserError if the disk refuses."""
     draft = draft_of(path)
-    try:
+    with writing(path):
         draft.write_bytes(content)
         sync(draft)
         draft.replace(path)
         sync(path.parent)
-    except OSError as error:
-        raise UserError(f"{path} cannot be written: {error.strerror}.") from error
 
 
 def write_answer(path: Path, content: bytes) -> None:
@@ -143,10 +150,8 @@ def write_answer(path: Path, content: bytes) -> None:
     the end of it.
     """
     if path.is_symlink() or (path.exists() and not path.is_file()):
-        try:
+        with writing(path):
             path.write_bytes(content)
-        except OSError as error:
-            raise UserError(f"{path} cannot be written: {error.strerror}.") from error
     else:
         write_file(path, content)
 

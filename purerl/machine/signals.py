@@ -2,7 +2,7 @@
 
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -29,11 +29,17 @@ def stop_signals(
         name = signal.Signals(number).name
         output.warn(f"\n{name}: {then}. Once more to stop at once.")
 
-    old = {}
-    if threading.current_thread() is threading.main_thread():
-        old = {number: signal.signal(number, handle) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
+    in_main = threading.current_thread() is threading.main_thread()
+    with handling((signal.SIGTERM, signal.SIGINT) if in_main else (), handle):
         yield lambda: bool(received)
+
+
+@contextmanager
+def handling(numbers: Iterable[int], handle: Callable[[int, Any], Any]) -> Iterator[None]:
+    """Has signals handled by `handle(number, frame)`, as long as this lasts."""
+    old = {number: signal.signal(number, handle) for number in numbers}
+    try:
+        yield
     finally:
         for number, handler in old.items():
             signal.signal(number, handler)

@@ -59,13 +59,17 @@ class Stage:
         """Lets the camera take its height and distance anew."""
         self.followed_height = None
 
-    def pose(self, picture: Picture) -> None:
-        """Puts everything where it is in a picture, given as numpy arrays, and aims the camera."""
+    def put(self, picture: Picture) -> None:
+        """Writes a picture, given as numpy arrays, into model and data; computes nothing."""
         for name, values in picture.changes.items():
             getattr(self.model, name)[...] = values
         self.data.qpos[:] = picture.qpos
         self.data.mocap_pos[:] = picture.mocap_pos
         self.data.mocap_quat[:] = picture.mocap_quat
+
+    def pose(self, picture: Picture) -> None:
+        """Puts everything where it is in a picture, and aims the camera."""
+        self.put(picture)
         mujoco.mj_fwdPosition(self.model, self.data)
         self._aim()
 
@@ -79,31 +83,30 @@ class Stage:
         if self.followed_height is None:
             # The height stays that of the episode's start, or the ground would bob with each step.
             self.followed_height = float(center[2])
-            own = self.model.body_rootid[self.model.geom_bodyid] == self.root
-            away = np.linalg.norm(self.data.geom_xpos[own] - center, axis=1)
-            radius = np.max(away + self.model.geom_rbound[own], initial=0.01)  # [m]
             # A view of 45 degrees is as high as 0.8 of the distance: room for body and ground.
-            self.camera.distance = 3.2 * radius
+            self.camera.distance = 3.2 * self.radius(0.01)
         self.camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         self.camera.azimuth, self.camera.elevation = 90.0, -15.0  # from the side: x to the right
         self.camera.lookat[:] = center[0], center[1], self.followed_height
+
+    def radius(self, least: float) -> float:
+        """Returns how far the body reaches from its centre of mass, at `least` so far [m]."""
+        own = self.model.body_rootid[self.model.geom_bodyid] == self.root
+        away = np.linalg.norm(self.data.geom_xpos[own] - self.data.subtree_com[self.root], axis=1)
+        return float(np.max(away + self.model.geom_rbound[own], initial=least))
 
 
 def add_scenery(scene: mujoco.MjvScene, scenery: tuple[Array, ...]) -> None:
     """Adds a picture's boxes to a scene that MuJoCo has updated."""
     for center, half_size in zip(*scenery, strict=True) if scenery else ():
-        _add_box(scene, np.asarray(center, float), np.asarray(half_size, float))
-
-
-def _add_box(scene: mujoco.MjvScene, center: np.ndarray, half_size: np.ndarray) -> None:
-    if scene.ngeom >= scene.maxgeom:
-        return
-    # 2 mm smaller: where the model has the same box, its surface and not this one is seen.
-    half_size = np.maximum(half_size - 0.002, 1e-4)
-    geom, box = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_BOX
-    color = np.array([0.4, 0.45, 0.5, 1.0], np.float32)
-    mujoco.mjv_initGeom(geom, box, half_size, center, np.eye(3).ravel(), color)
-    scene.ngeom += 1
+        if scene.ngeom >= scene.maxgeom:
+            return
+        # 2 mm smaller: where the model has the same box, its surface and not this one is seen.
+        size = np.maximum(np.asarray(half_size, float) - 0.002, 1e-4)
+        geom, box = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_BOX
+        color, upright = np.array([0.4, 0.45, 0.5, 1.0], np.float32), np.eye(3).ravel()
+        mujoco.mjv_initGeom(geom, box, size, np.asarray(center, float), upright, color)
+        scene.ngeom += 1
 
 
 def default_camera(model: mujoco.MjModel) -> int | None:

@@ -14,10 +14,7 @@ import numpy as np
 from purerl.core.errors import unknown_name
 from purerl.core.records import Array
 
-_TYPES = {
-    kind: getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
-    for kind in ("body", "joint", "geom", "site", "sensor", "actuator", "tendon", "camera")
-}
+# Kinds of objects, and how a model counts them.
 _COUNTS = {"body": "nbody", "joint": "njnt", "geom": "ngeom", "site": "nsite", "sensor": "nsensor"}
 _COUNTS |= {"actuator": "nu", "tendon": "ntendon", "camera": "ncam"}
 
@@ -31,8 +28,7 @@ def hash_model(model: mujoco.MjModel, rest: tuple = ()) -> str:
 
 def names(model: mujoco.MjModel, kind: str) -> list[str]:
     """Returns the names of all objects of a kind ("body", "joint", "sensor", ...), by id."""
-    number = getattr(model, _COUNTS[kind])
-    return [mujoco.mj_id2name(model, _TYPES[kind], i) or "" for i in range(number)]
+    return [getattr(model, kind)(i).name for i in range(getattr(model, _COUNTS[kind]))]
 
 
 def find(model: mujoco.MjModel, kind: str, name: str) -> int:
@@ -46,12 +42,12 @@ def find(model: mujoco.MjModel, kind: str, name: str) -> int:
     Raises:
       ValueError: there is none of that name; the message lists those there are.
     """
-    if kind not in _TYPES:
-        raise ValueError(unknown_name("kind of object", kind, _TYPES))
-    found = mujoco.mj_name2id(model, _TYPES[kind], name)
-    if found < 0:
-        raise ValueError(unknown_name(kind, name, names(model, kind)))
-    return found
+    if kind not in _COUNTS:
+        raise ValueError(unknown_name("kind of object", kind, _COUNTS))
+    try:
+        return getattr(model, kind)(name).id
+    except KeyError as error:
+        raise ValueError(unknown_name(kind, name, names(model, kind))) from error
 
 
 def qpos_indices(model: mujoco.MjModel, joints: Iterable[str]) -> np.ndarray:

@@ -4,7 +4,6 @@ One HTML file: curves, every metric, evaluations, settings, videos. It needs no 
 browser opens it; hover for values. Nothing of the runs is executed.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from purerl.core.errors import UserError
-from purerl.experiment.command_line import carry_out
+from purerl.experiment.command_line import main_of
 from purerl.machine.command_errors import leave
 from purerl.machine.output import show
 
@@ -30,11 +29,6 @@ class ReportOptions:
     differ, but the seed."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    return carry_out(ReportOptions, command, "python -m purerl.report", arguments)
-
-
 def command(options: ReportOptions) -> None:
     """Writes the page, and prints where it is."""
     from purerl.machine.files import write_answer
@@ -50,6 +44,9 @@ def command(options: ReportOptions) -> None:
     write_answer(options.out, page)
     number = f"{len(runs)} run{'s' * (len(runs) > 1)}"
     show(f"{options.out} ({number}, {len(page):,} bytes): open it in a browser")
+
+
+main = main_of(ReportOptions, command, "python -m purerl.report")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,13 @@
 """Runs compared: `compare` gathers everything, `describe` tells it, `write` makes files of it."""
 
+import contextlib
 import csv
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import UserError
-from purerl.machine.files import write_json
+from purerl.machine.files import write_json, writing
 from purerl.machine.output import printable
 from purerl.report import bit_diff, run_reader, seed_statistics
 from purerl.report.bootstrap import LEAST_RUNS
@@ -181,15 +182,13 @@ def write(folder: Path, result: dict[str, Any], curves: Sequence[Curve]) -> None
       curves: what it returned second.
     """
     groups = (group | (group["interval"] or {}) for group in result["groups"])
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "compare.json", result)
         write_csv(folder / "groups.csv", GROUPS_CSV, groups)
         write_csv(folder / "curves.csv", CURVES_CSV, _curve_rows(curves))
         if curves:
             draw_curves(folder / "curves.png", curves, result["metric"])
-    except OSError as error:
-        raise UserError(f"{folder} cannot be written: {error.strerror}.") from error
 
 
 def _curve_rows(curves: Iterable[Curve]) -> Iterator[dict[str, Any]]:
@@ -219,27 +218,39 @@ def plotter() -> Any:
     return pyplot
 
 
-def draw_curves(path: Path, curves: Sequence[Curve], metric: str) -> None:
-    """Writes a picture of each group's IQM, its band, and its runs as thin lines."""
+@contextlib.contextmanager
+def picture(path: Path, *shape: int, **options: Any) -> Iterator[tuple[Any, Any]]:
+    """Yields a figure and its axes, of pyplot's `subplots`; then writes it.
+
+    Raises:
+      UserError: the disk refuses it.
+    """
     pyplot = plotter()
-    figure, axes = pyplot.subplots(figsize=(8, 5), layout="constrained")
-    for i, curve in enumerate(curves):
-        color = f"C{i % 10}"
-        for run in curve.runs:
-            axes.plot(list(run), list(run.values()), color=color, linewidth=0.5, alpha=0.4)
-        iqm, low, high = curve.band
-        if low is not None and high is not None:
-            axes.fill_between(curve.steps, low, high, color=color, alpha=0.2, linewidth=0)
-        label = printable(f"{curve.label} (n = {len(curve.runs)})")
-        axes.plot(curve.steps, iqm, color=color, linewidth=2, label=label)
-    axes.plot([], [], color="gray", linewidth=0.5, label="each run")
-    axes.set(xlabel="control steps", ylabel=printable(metric), title=curves_title(curves))
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize="small")
+    figure, axes = pyplot.subplots(*shape, layout="constrained", **options)
     try:
-        figure.savefig(path, dpi=120)
+        yield figure, axes
+        with writing(path):
+            figure.savefig(path, dpi=120)
     finally:  # a notebook would draw what is left open
         pyplot.close(figure)
+
+
+def draw_curves(path: Path, curves: Sequence[Curve], metric: str) -> None:
+    """Writes a picture of each group's IQM, its band, and its runs as thin lines."""
+    with picture(path, figsize=(8, 5)) as (_, axes):
+        for i, curve in enumerate(curves):
+            color = f"C{i % 10}"
+            for run in curve.runs:
+                axes.plot(list(run), list(run.values()), color=color, linewidth=0.5, alpha=0.4)
+            iqm, low, high = curve.band
+            if low is not None and high is not None:
+                axes.fill_between(curve.steps, low, high, color=color, alpha=0.2, linewidth=0)
+            label = printable(f"{curve.label} (n = {len(curve.runs)})")
+            axes.plot(curve.steps, iqm, color=color, linewidth=2, label=label)
+        axes.plot([], [], color="gray", linewidth=0.5, label="each run")
+        axes.set(xlabel="control steps", ylabel=printable(metric), title=curves_title(curves))
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize="small")
 
 
 def curves_title(curves: Iterable[Curve]) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 from purerl.report.comparison import GROUPS, VERSUS, cell, notes
 from purerl.report.html_elements import Html, element, join, table
 from purerl.report.page_series import RETURN, SPREAD
-from purerl.report.run_reader import RunRecord
+from purerl.report.run_reader import RunRecord, flatten
 
 FIRST = [RETURN, SPREAD, f"{RETURN}_min", f"{RETURN}_max", "eval/episode_length", "eval/lost"]
 MANY = 200  # characters of a value, after which it is cut
@@ -121,7 +121,7 @@ def settings(runs: Sequence[RunRecord], result: dict[str, Any]) -> list[Html]:
         element("p", f"Other conditions: {_cut(line)}", class_="note")
         for line in result["conditions_that_differ"]
     ]
-    conditions = _flatten({k: v for k, v in runs[0].manifest.items() if k != "source"})
+    conditions = flatten({k: v for k, v in runs[0].manifest.items() if k != "source"})
     return [
         *parts,
         _details(f"All settings of {runs[0].path.name}", runs[0].settings),
@@ -132,15 +132,6 @@ def settings(runs: Sequence[RunRecord], result: dict[str, Any]) -> list[Html]:
 def _details(title: str, values: dict[str, Any]) -> Html:
     rows = [[name, _cut(value)] for name, value in values.items()]
     return element("details", element("summary", title), table(["name", "value"], rows))
-
-
-def _flatten(values: dict[str, Any]) -> dict[str, Any]:
-    """Returns objects inside as {"a.b": value}, one level deep."""
-    found: dict[str, Any] = {}
-    for name, value in values.items():
-        inside = value.items() if isinstance(value, dict) else [(None, value)]
-        found |= {name if key is None else f"{name}.{key}": each for key, each in inside}
-    return found
 
 
 def _cut(value: Any) -> str:

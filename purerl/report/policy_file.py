@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from purerl.core.records import PyTree
@@ -35,20 +36,11 @@ class Recorded(NamedTuple):
         """
         largest = 0.0
         for t in range(self.action.shape[1]):
-            now = {name: x[:, t] for name, x in self.parts().items()}
-            action = policy(now if isinstance(self.observation, dict) else now[""])
-            largest = max(largest, self._farthest(action, t))
+            action = policy(jax.tree.map(lambda x, t=t: x[:, t], self.observation))
+            gap = np.abs(np.asarray(action, float) - self.action[:, t])[t < self.length]
+            # NaN is no small difference.
+            largest = max(largest, float(np.nan_to_num(gap, nan=np.inf).max(initial=0.0)))
         return largest
-
-    def parts(self) -> dict[str, np.ndarray]:
-        """Returns the observation's arrays [N, T, O] by name; the only one's name is ""."""
-        return self.observation if isinstance(self.observation, dict) else {"": self.observation}
-
-    def _farthest(self, action: np.ndarray, t: int) -> float:
-        running = t < self.length
-        # NaN is no small difference.
-        gap = np.abs(np.asarray(action, float) - self.action[:, t])[running]
-        return float(np.nan_to_num(gap, nan=np.inf).max(initial=0.0))
 
 
 def record_episodes(run: Run, seed: int) -> Recorded:

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import onnx
 import onnxruntime
-from onnx import helper, numpy_helper
+from onnx import helper
 
 from purerl.core.records import Array, PyTree
 from purerl.machine.files import write_answer
-from purerl.report.flat_program import Program, Value, batched, flat_program, sizes
-from purerl.report.onnx_nodes import OPSET, write_step
+from purerl.report.flat_program import batched, flat_program
+from purerl.report.onnx_nodes import OPSET, Nodes
 from purerl.report.policy_file import control_range, origin
 from purerl.report.policy_function import PolicyFunction, policy_function
 from purerl.report.policy_jax import remembering
@@ -83,64 +83,6 @@ def build_model(
 
 def _info(name: str, shape: tuple[int, ...]) -> onnx.ValueInfoProto:
     return helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["batch", *shape])
-
-
-class Nodes:
-    """The nodes of a graph and its constants, as they are collected."""
-
-    def __init__(self, given: list[str]) -> None:
-        """Begins with the names of the inputs."""
-        self.names: dict[int, str] = dict(enumerate(given))  # value -> name
-        self.nodes: list[onnx.NodeProto] = []
-        self.constants: list[onnx.TensorProto] = []
-        self.shapes: dict[tuple[int, ...], str] = {}  # with 0 for the batch -> name
-        self.first = given[0]
-
-    def write(self, program: Program, outputs: list[str]) -> None:
-        """Adds a program's steps; its outputs get their names."""
-        for step in program.steps:
-            made = write_step(self, step, list(step.inputs))
-            many = made if isinstance(made, list) else [made]
-            self.names |= dict(zip(step.outputs, many, strict=True))
-        for value, name in zip(program.outputs, outputs, strict=True):
-            whole = self.name(value)
-            self.nodes.append(helper.make_node("Identity", [whole], [name]))
-
-    def name(self, value: Value | str) -> str:
-        """Returns the name of a value, a constant being added under a new one."""
-        if isinstance(value, str):
-            return value
-        if isinstance(value, int):
-            return self.names[value]
-        name = f"constant_{len(self.constants)}"
-        self.constants.append(numpy_helper.from_array(np.array(value, order="C"), name))
-        return name
-
-    def node(self, kind: str, *inputs: Value | str, outputs: int = 1, **attributes: Any) -> Any:
-        """Adds a node; returns the name of its output, or a list of them."""
-        made = [f"{kind.lower()}_{len(self.nodes)}_{i}" for i in range(outputs)]
-        self.nodes.append(helper.make_node(kind, [*map(self.name, inputs)], made, **attributes))
-        return made if outputs > 1 else made[0]
-
-    def batched(self, value: Value | str, shape: tuple[Any, ...]) -> str:
-        """Returns a value at its full shape, where it was only broadcast so far."""
-        if isinstance(value, int):
-            return self.name(value)
-        key = tuple(sizes(shape, 0))
-        if key == shape:
-            return self.node("Expand", value, np.asarray(shape, np.int64))
-        if key not in self.shapes:
-            self.shapes[key] = self._shape(key)
-        return self.node("Expand", value, self.shapes[key])
-
-    def _shape(self, shape: tuple[int, ...]) -> str:
-        """Adds a shape with the batch's size where there is a 0."""
-        size = self.node("Slice", self.node("Shape", self.first), _one(0), _one(1))
-        return self.node("Concat", *(_one(n) if n else size for n in shape), axis=0)
-
-
-def _one(number: int) -> np.ndarray:
-    return np.asarray([number], np.int64)
 
 
 def caller(file: Path) -> Callable[[PyTree, PyTree], tuple[np.ndarray, PyTree]]:

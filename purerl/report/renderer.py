@@ -7,13 +7,22 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from purerl.physics.drawing import (
-    Picture,
-    Stage,
-    add_scenery,
-    root_body as root_body,  # for rooms that may not import physics
-)
+from purerl.core.errors import UserError
+
+# The last one is for rooms that may not import physics.
+from purerl.physics.drawing import Picture, Stage, add_scenery, root_body  # noqa: F401
 from purerl.report.opengl import open_gl
+
+
+def model_of(env: Any) -> mujoco.MjModel:
+    """Returns the model of an environment that can be drawn; UserError if it cannot."""
+    physics: Any = getattr(env, "physics", None)
+    if not hasattr(physics, "model"):
+        raise UserError(
+            f"The environment {type(env).__name__} cannot be drawn: it has no `physics` of the "
+            "type purerl.Physics."
+        )
+    return physics.model
 
 
 class Renderer(contextlib.AbstractContextManager):

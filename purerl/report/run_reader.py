@@ -49,7 +49,8 @@ class RunRecord(NamedTuple):
     def curve(self, metric: str) -> dict[int, float]:
         """Returns steps -> value wherever the metric was measured and finite."""
         found = {line["steps"]: line.get(metric) for line in self.lines}
-        return {steps: float(v) for steps, v in found.items() if v is not None and _is_finite(v)}
+        most = sys.float_info.max  # of a float; JSON's integers have no end
+        return {n: float(v) for n, v in found.items() if v is not None and abs(v) <= most}
 
 
 def find_runs(arguments: Iterable[Path]) -> list[Path]:
@@ -79,7 +80,7 @@ def read(path: Path) -> RunRecord:
     return RunRecord(
         path=path,
         seed=settings["seed"],
-        settings=experiment | _flatten(learning) | experiment | _went_on(folder),
+        settings=experiment | flatten(learning) | experiment | _went_on(folder),
         manifest=folder.manifest,
         source=folder.code,
         lines=[_check_line(f"{file}, line {i}", x) for i, x in enumerate(read_metrics(file), 1)],
@@ -115,16 +116,11 @@ def _check_line(where: str, line: dict[str, Any]) -> dict[str, Any]:
     return line
 
 
-def _is_finite(value: float) -> bool:
-    """Tells whether a number is one that a float holds: JSON's integers have no end."""
-    return abs(value) <= sys.float_info.max
-
-
-def _flatten(value: Any, path: str = "") -> dict[str, Any]:
+def flatten(value: Any, path: str = "") -> dict[str, Any]:
     """Returns nested settings as {"a.b": value}; lists stay whole."""
     if not isinstance(value, dict):
         return {path: value}
-    inner = [_flatten(v, f"{path}.{k}" if path else k) for k, v in value.items()]
+    inner = [flatten(v, f"{path}.{k}" if path else k) for k, v in value.items()]
     return {k: v for part in inner for k, v in part.items()}
 
 

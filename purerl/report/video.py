@@ -16,7 +16,7 @@ from purerl.machine.files import check_inside
 from purerl.report import run_reader
 from purerl.report.episode_pictures import Recording, episode_pictures, frame_stride, record
 from purerl.report.page_series import RETURN
-from purerl.report.renderer import Renderer
+from purerl.report.renderer import Renderer, model_of
 from purerl.runs.loaded_run import Run
 
 SHEET = 4  # rows and columns of the contact sheet
@@ -70,14 +70,9 @@ def videos_of(folder: Path) -> Path:
 
 def renderer_of(env: Any, size: tuple[int, int], camera: str = "") -> Renderer:
     """Returns a renderer for an environment, to be used in a `with`; see `make_video`."""
-    physics: Any = getattr(env, "physics", None)
-    if not hasattr(physics, "model"):
-        raise UserError(
-            f"The environment {type(env).__name__} cannot be drawn: it has no `physics` of the "
-            "type purerl.Physics."
-        )
+    model = model_of(env)
     try:
-        return Renderer(physics.model, *size, camera)
+        return Renderer(model, *size, camera)
     except ValueError as error:
         raise UserError(str(error)) from error
 

@@ -1,20 +1,18 @@
 """What is planned for or looked at: an experiment, or a run with what it has learned."""
 
 import argparse
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from purerl.core.errors import SUCCESS, USAGE, RunError, StoppedError, UserError
+from purerl.core.errors import UserError
 from purerl.experiment import loading
 from purerl.experiment.command_line import from_command_line, parse
 from purerl.experiment.definition import Experiment
 from purerl.experiment.loading import Source
 from purerl.experiment.options import check_seed
 from purerl.machine import output
-from purerl.machine.command_errors import tell
 from purerl.runs.folder import CODE
 from purerl.runs.loaded_run import Run, load
 from purerl.tune.plan.settings import Settings
@@ -48,34 +46,18 @@ class Subject(NamedTuple):
     run: Run | None  # if it is one
 
 
-def carry_out_on_subject(
-    command: Callable[[Sequence[str]], None],
-    base: Any,
-    about: str | None,
-    prog: str,
-    arguments: Sequence[str] | None,
-) -> int:
-    """Runs a command whose first word is a subject; returns its exit code.
+def show_help(base: Any, about: str | None, prog: str, words: Sequence[str]) -> None:
+    """Prints the help page of a command whose first word is a subject.
 
     Args:
-      command: is called with the words.
-      base: the dataclass of its options.
-      about: of the command, for its help page. The options of an environment are on the page that
-        the command has for it.
+      base: the dataclass of its options, which are listed if the `words` ask for it.
+      about: of the command. The options of an environment are on the page that it has for that.
       prog: the command's own words.
-      arguments: the command line; None: this process's.
+      words: the command line.
     """
-    words = sys.argv[1:] if arguments is None else list(arguments)
-    try:
-        if words and words[0] not in ("-h", "--help"):
-            command(words)
-            return SUCCESS
-        output.show(*str(about).split("\n"), f"Of the environment: {prog} EXPERIMENT --help", "")
-        if words:
-            parse(base, ["--help"], prog)
-        return USAGE
-    except (UserError, RunError, StoppedError) as error:
-        return tell(error)
+    output.show(*str(about).split("\n"), f"Of the environment: {prog} EXPERIMENT --help", "")
+    if words:
+        parse(base, ["--help"], prog)
 
 
 def find(words: Sequence[str], prog: str) -> Subject:

@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable, Iterator, Mapping
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -29,24 +30,6 @@ class Playing(NamedTuple):
 
     progress: Progress
     plan: Plan
-
-
-class NoMemory(NamedTuple):
-    """Stands for the state of a run where nothing but the shape of a memory is asked for."""
-
-    carry: tuple = ()
-
-
-def begin(
-    config: Config, settings: Settings, env: Env, guide: Guide, key: Array, number: int
-) -> Playing:
-    """Returns E episodes about to start, by a key [] that nothing else uses."""
-    nothing: Any = NoMemory()
-    progress = evaluation.start(env, nothing, key, number, config.episode_length)
-    plans = jax.tree.map(
-        lambda x: jnp.broadcast_to(x, (number, *x.shape)), planner.start(settings, env, guide)
-    )
-    return Playing(progress, plans)
 
 
 def advance(
@@ -132,7 +115,10 @@ def episodes(
     others = judges or {}
 
     def first(learned: Any, key: Array) -> Playing:
-        return begin(config, settings, env, make_guide(learned), key, number)
+        nothing: Any = SimpleNamespace(carry=())  # the guide's memory is in the plan
+        plan = planner.start(settings, env, make_guide(learned))
+        plans = jax.tree.map(lambda x: jnp.broadcast_to(x, (number, *x.shape)), plan)
+        return Playing(evaluation.start(env, nothing, key, number, config.episode_length), plans)
 
     def chunk(learned: Any, key: Array, playing: Playing) -> tuple[Playing, dict[str, Any]]:
         step = functools.partial(advance, settings, env, others, keep, make_guide(learned), key)

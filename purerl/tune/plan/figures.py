@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from purerl.report import comparison
 from purerl.report.bootstrap import LEAST_RUNS, mean_interval
 from purerl.tune.plan.episodes import TERM
 
@@ -22,16 +23,11 @@ def table(groups: Mapping[str, Figures]) -> list[str]:
     """
     first, *rest = groups.values()
     names = sorted(set(first).union(*rest), key=lambda name: ("return" not in name, name))
-    columns = {name: [said(group.get(row)) for row in names] for name, group in groups.items()}
     if rest:
-        columns["difference"] = [
-            said(rest[0][row] - first[row] if row in first and row in rest[0] else None)
-            for row in names
-        ]
-    lines = [["", *columns], *([n, *row] for n, *row in zip(names, *columns.values(), strict=True))]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    cells = [[f"{x:>{w}}" for x, w in zip(line, widths, strict=True)] for line in lines]
-    return ["  ".join([row[0].strip().ljust(widths[0]), *row[1:]]).rstrip() for row in cells]
+        both = first.keys() & rest[0].keys()
+        groups = {**groups, "difference": {name: rest[0][name] - first[name] for name in both}}
+    rows = [{"": name} | {g: said(x.get(name)) for g, x in groups.items()} for name in names]
+    return comparison.table([(head, head) for head in ("", *groups)], rows)
 
 
 def notes(groups: Mapping[str, Figures]) -> list[str]:

@@ -1,26 +1,17 @@
 """Videos of planned episodes, drawn as those of a run's policy are."""
 
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from purerl.core.env import Env, State
+from purerl.core.env import Env
 from purerl.report.episode_pictures import Recording, take_picture
 from purerl.report.video import draw, renderer_of
 from purerl.tune.plan.episodes import Playing
-
-
-def keep_picture(env: Env) -> Callable[[State], Any]:
-    """Returns what keeps how one environment's state looks; see `episodes.advance`."""
-    return lambda state: take_picture(env, state)
-
-
-def keep_observation(state: State) -> Any:
-    """Keeps what is observed of a state: episodes that begin alike are known by it."""
-    return state.observation
 
 
 def film(
@@ -35,7 +26,7 @@ def film(
       end: the episodes, over.
       rows: of `episodes.episodes`, with pictures kept.
     """
-    last = jax.device_get(jax.vmap(keep_picture(env))(end.progress.env_state))
+    last = jax.device_get(jax.vmap(functools.partial(take_picture, env))(end.progress.env_state))
     kept = [row["kept"] for row in rows] + [jax.tree.map(lambda x: x[None], last)]
     pictures = jax.tree.map(lambda *parts: np.concatenate(parts), *kept)
     running = np.concatenate([row["running"] for row in rows])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import operator
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,8 +13,9 @@ from purerl.checks.user_code import users_errors
 from purerl.core.errors import StoppedError
 from purerl.experiment.objects import naming_broken_rules
 from purerl.machine import output
+from purerl.report.episode_pictures import take_picture
 from purerl.tune.plan import episodes, figures, planner
-from purerl.tune.plan.filming import film, keep_observation, keep_picture
+from purerl.tune.plan.filming import film
 
 FRAME = (640, 480)  # of a video [pixels]
 SAY = 10.0  # between two lines about how it goes [s]
@@ -45,7 +47,9 @@ def play(problem: Any, options: Any, judges: dict[str, Any], stop: Callable[[], 
     config = dataclasses.replace(config, episode_length=limit)
 
     guide = functools.partial(planner.guide_of, config, env, network)
-    keep = keep_picture(env) if options.video else keep_observation
+    # Episodes that begin alike are known by what is observed.
+    observation = operator.attrgetter("observation")
+    keep = functools.partial(take_picture, env) if options.video else observation
     game = (config, options, env, guide, problem.learned, options.seed, options.episodes)
     rows: list[Any] = []
     begin = spoke = time.perf_counter()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from purerl.core.errors import UserError
+from purerl.core.errors import UserError, check_least
 from purerl.experiment.definition import Experiment
 from purerl.experiment.objects import Setup, build
 from purerl.experiment.settings_json import to_json
@@ -40,9 +40,7 @@ class PlanCommandOptions(PlanOptions):
     def __post_init__(self) -> None:
         """Checks the rules."""
         super().__post_init__()
-        for name, least in (("episodes", 1), ("steps", 0)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}.")
+        check_least(self, ValueError, episodes=1, steps=0)
         for name in ("csv", "json", "video"):
             file = getattr(self, name)
             if file is None:

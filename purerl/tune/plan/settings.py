@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from purerl.core.errors import check_least
+
 # The first sample is the plan itself, which begins as 0, and the second is 0: what a policy does.
 NO_SEARCH: dict[str, Any] = {"samples": 2, "elites": 2, "horizon": 1, "knots": 2}
 
@@ -35,10 +37,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Raises ValueError for a number outside its range."""
-        least = {"samples": 2, "horizon": 1, "knots": 2, "iterations": 1, "elites": 1}
-        for name, low in least.items():
-            if getattr(self, name) < low:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {low}.")
+        check_least(self, ValueError, samples=2, horizon=1, knots=2, iterations=1, elites=1)
         for name in ("noise", "temperature"):
             if not 0.0 < getattr(self, name) < float("inf"):
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be above 0.")

@@ -4,8 +4,9 @@ So a spline is a matrix, made once: actions [H, A] = weights [H, K] @ knots [K, 
 """
 
 import numpy as np
+from scipy import interpolate
 
-KINDS = ("zero", "linear", "cubic")
+KINDS = ("zero", "linear", "cubic")  # the first two by their degree
 
 
 def knot_times(kind: str, horizon: int, knots: int) -> np.ndarray:
@@ -38,17 +39,10 @@ def weights(kind: str, times: np.ndarray, knots: np.ndarray) -> np.ndarray:
       knots: [K] of the knots, increasing; at least 2.
     """
     times, one = np.clip(times, knots[0], knots[-1]), np.eye(len(knots))
-    left = np.clip(np.searchsorted(knots, times, side="right") - 1, 0, len(knots) - 1)
-    if kind == "zero":
-        return one[left].astype(np.float32)
-    left = np.minimum(left, len(knots) - 2)
-    width = np.diff(knots)
-    u = ((times - knots[left]) / width[left])[:, None]
-    if kind == "linear":
-        return ((1.0 - u) * one[left] + u * one[left + 1]).astype(np.float32)
-    secants = np.diff(one, axis=0) / width[:, None]
-    slopes = np.concatenate([secants[:1], (secants[:-1] + secants[1:]) / 2.0, secants[-1:]])
-    h = width[left][:, None]
-    values = (2 * u**3 - 3 * u**2 + 1) * one[left] + (3 * u**2 - 2 * u**3) * one[left + 1]
-    turns = (u**3 - 2 * u**2 + u) * slopes[left] + (u**3 - u**2) * slopes[left + 1]
-    return (values + h * turns).astype(np.float32)
+    if kind == "cubic":
+        secants = np.diff(one, axis=0) / np.diff(knots)[:, None]
+        slopes = np.concatenate([secants[:1], (secants[:-1] + secants[1:]) / 2.0, secants[-1:]])
+        spline = interpolate.CubicHermiteSpline(knots, one, slopes)
+    else:
+        spline = interpolate.make_interp_spline(knots, one, k=KINDS.index(kind))
+    return spline(times).astype(np.float32)

@@ -10,11 +10,12 @@ from typing import Annotated, Any
 
 import tyro
 
-from purerl.core.errors import UserError, nearest, one_line, unknown_name
+from purerl.core.errors import UserError, check_least, nearest, one_line, unknown_name
 from purerl.experiment import command_line
 from purerl.experiment.loading import find_source
 from purerl.experiment.options import RunOptions
 from purerl.machine.files import check_name, read_bytes
+from purerl.report.run_reader import flatten
 from purerl.tune.sweep import points
 from purerl.tune.sweep.points import Base
 
@@ -38,9 +39,9 @@ class SweepOptions:
     stopped. Exit codes: 0 done, 1 a run failed, 2 a mistake in the command, 3 stopped on request.
     """
 
-    grid: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    grid: Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction] = ()
     """SETTING=1,2,3: every combination of the values. May come several times."""
-    over: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    over: Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction] = ()
     """SETTING=1..8, SETTING=log:1e-5:1e-2 or SETTING=1,2,3: drawn by --random or --optuna."""
     random: int = 0
     """Draw this many points; with a larger number later, the first ones stay."""
@@ -62,9 +63,13 @@ class SweepOptions:
     dry_run: bool = False
     """Check everything, print the commands, and start none."""
 
+    @property
+    def swept(self) -> list[str]:
+        """What is swept, SETTING=VALUES; an option without any is a text without any."""
+        return [text for texts in self.grid or self.over for text in texts or ("",)]
+
 
 OWN = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(SweepOptions)}
-SEVERAL = ("--grid", "--over")
 
 
 def read(arguments: Sequence[str]) -> tuple[SweepOptions, Base, list[str]]:
@@ -83,8 +88,8 @@ def read(arguments: Sequence[str]) -> tuple[SweepOptions, Base, list[str]]:
     if words[0].startswith("-"):
         raise UserError(f"The first word must be the experiment or a .toml file: {PROG} EXPERIMENT")
     named, *words = words
-    own, rest = split(words)
-    options = command_line.parse(SweepOptions, own, PROG)
+    # What is none of the sweep's own options goes to the runs.
+    options, rest = command_line.parse(SweepOptions, words, PROG, return_unknown_args=True)
     if options.name:
         check_name("name", options.name)
     source = find_source(named)
@@ -114,38 +119,12 @@ def check(options: SweepOptions) -> None:
         raise UserError("--over says what is drawn; say how many points: --random 20.")
     if drawn and not options.over:
         raise UserError(f"--{ways[0]} draws nothing; say what: --over SETTING=log:1e-5:1e-2.")
-    for name, least in (("seeds", 1), ("jobs", 0), ("random", 0), ("optuna", 0)):
-        if getattr(options, name) < least:
-            raise UserError(f"{name} is {getattr(options, name)}; it must be at least {least}.")
+    check_least(options, UserError, seeds=1, jobs=0, random=0, optuna=0)
     if options.slurm and options.optuna:
         raise UserError(
             "--optuna chooses a point when others have ended, and --slurm submits all at once; "
             "leave one of them out."
         )
-
-
-def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Divides words into those of the sweep's own options and the others, which go to the runs."""
-    own: list[str] = []
-    rest: list[str] = []
-    todo = list(words)
-    while todo:
-        word = todo.pop(0)
-        name, equals, value = word.partition("=")
-        name = name.replace("_", "-")
-        if not name.startswith("--") or name not in OWN:
-            rest.append(word)
-            continue
-        values = [value] if equals else []
-        if name != "--dry-run" and not equals:
-            values = [todo.pop(0)] if todo and not todo[0].startswith("--") else []
-            while name in SEVERAL and todo and not todo[0].startswith("--"):
-                values.append(todo.pop(0))
-        if name in SEVERAL:
-            own += [part for one in values or [""] for part in (name, one)]
-        else:
-            own += [name, *values]
-    return own, rest
 
 
 def _read_settings(source: Any, named: str, rest: list[str]) -> Any:
@@ -182,7 +161,7 @@ def _read_file(path: Path) -> tuple[list[str], dict[str, Any]]:
         raise UserError(f'{path} names no experiment; write experiment = "cartpole_swingup".')
     words = [found.pop("experiment")]
     settings = _table(path, "settings", found.pop("settings", {}))
-    for name in (word.removeprefix("--") for word in SEVERAL):
+    for name in ("grid", "over"):
         for setting, values in _table(path, name, found.pop(name, {})).items():
             words += [f"--{name}", f"{setting}={_texts(path, setting, values)}"]
     for name, value in found.items():
@@ -194,11 +173,7 @@ def _table(path: Path, name: str, value: Any) -> dict[str, Any]:
     """Returns a table with dotted names, `{"ppo": {"clip": 1}}` as `{"ppo.clip": 1}`."""
     if not isinstance(value, Mapping):
         raise UserError(f"{path}: {name} is {value!r}; it must be a table, [{name}].")
-    found: dict[str, Any] = {}
-    for key, one in value.items():
-        inner = _table(path, key, one) if isinstance(one, Mapping) else {"": one}
-        found |= {f"{key}.{rest}".rstrip("."): x for rest, x in inner.items()}
-    return {key.replace("_", "-"): one for key, one in found.items()}
+    return {key.replace("_", "-"): one for key, one in flatten(value).items()}
 
 
 def _texts(path: Path, setting: str, values: Any) -> str:

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from purerl.core.errors import UserError
 from purerl.machine.output import printable
-from purerl.report.comparison import plotter
+from purerl.report.comparison import picture
 from purerl.tune.sweep.spaces import Space
 from purerl.tune.sweep.table import Row, by_value, is_number
 
@@ -35,29 +34,20 @@ def draw(path: Path, rows: Sequence[Row], spaces: Sequence[Space], metric: str) 
     rows = [row for row in rows if row.summary["iqm"] is not None]
     if not rows:
         return False
-    pyplot = plotter()
     columns = min(COLUMNS, len(spaces))
     lines = -(-len(spaces) // columns)
-    figure, axes = pyplot.subplots(
-        lines, columns, figsize=(4.5 * columns + 1, 3.6 * lines), sharey=True, squeeze=False,
-        layout="constrained",
-    )  # fmt: skip
-    for panel, space in zip(axes.flat, spaces, strict=False):
-        _draw_panel(panel, rows, space)
-    for panel in axes.flat[len(spaces) :]:
-        panel.set_axis_off()
-    for panel in axes[:, 0]:
-        panel.set_ylabel(printable(metric))
-    handles = max(
-        (panel.get_legend_handles_labels() for panel in axes.flat), key=lambda x: len(x[0])
-    )
-    figure.legend(*handles, loc="outside lower center", ncols=4, fontsize="small")
-    try:
-        figure.savefig(path, dpi=120)
-    except OSError as error:
-        raise UserError(f"{path} cannot be written: {error.strerror}.") from error
-    finally:
-        pyplot.close(figure)
+    size = (4.5 * columns + 1, 3.6 * lines)
+    with picture(path, lines, columns, figsize=size, sharey=True, squeeze=False) as (figure, axes):
+        for panel, space in zip(axes.flat, spaces, strict=False):
+            _draw_panel(panel, rows, space)
+        for panel in axes.flat[len(spaces) :]:
+            panel.set_axis_off()
+        for panel in axes[:, 0]:
+            panel.set_ylabel(printable(metric))
+        handles = max(
+            (panel.get_legend_handles_labels() for panel in axes.flat), key=lambda x: len(x[0])
+        )
+        figure.legend(*handles, loc="outside lower center", ncols=4, fontsize="small")
     return True
 
 

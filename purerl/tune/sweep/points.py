@@ -15,6 +15,7 @@ from purerl.experiment.definition import Experiment
 from purerl.experiment.kinds import hints
 from purerl.experiment.loading import Source
 from purerl.experiment.options import RunOptions
+from purerl.tune.option_numbers import Place, replaced
 from purerl.tune.sweep.scheduler import Job
 from purerl.tune.sweep.spaces import Space, Values, parse_space
 
@@ -41,11 +42,6 @@ class Base(NamedTuple):
     seeds: int
     folder: Path  # of the sweep
     options: RunOptions  # of each run, as the words give them
-
-    @property
-    def name(self) -> str:
-        """The experiment's name."""
-        return self.source.name
 
 
 def read_spaces(base: Base, texts: Iterable[str], given: Sequence[str]) -> list[Space]:
@@ -122,18 +118,21 @@ def _bool_word(name: str, text: str) -> str:
     return text.capitalize()
 
 
-def check(base: Base, values: Values) -> Experiment:
-    """Returns the experiment of a point; UserError if its settings break a rule together."""
-    typed = {name: read_value(base, name, text) for name, text in values.items()}
-    return check_typed(base, values, typed)
+def typed_values(base: Base, points: Sequence[Point]) -> list[dict[str, Any]]:
+    """Returns each point's settings with their values: each text is read once, for it takes long.
+
+    Raises:
+      UserError: a value is of the wrong type.
+    """
+    pairs = {pair for point in points for pair in point.values.items()}
+    read = {pair: read_value(base, *pair) for pair in sorted(pairs)}
+    return [{name: read[name, text] for name, text in one.values.items()} for one in points]
 
 
 def check_all(base: Base, points: Sequence[Point]) -> None:
-    """Checks every point; each value is read once, since reading takes most of the time."""
-    pairs = {pair for point in points for pair in point.values.items()}
-    read = {pair: read_value(base, *pair) for pair in sorted(pairs)}
-    for point in points:
-        check_typed(base, point.values, {n: read[n, text] for n, text in point.values.items()})
+    """Raises UserError if the settings of a point break a rule together."""
+    for point, typed in zip(points, typed_values(base, points), strict=True):
+        _check(base, point.values, typed)
 
 
 def check_evaluated(base: Base, spaces: Sequence[Space], metric: str) -> None:
@@ -148,29 +147,15 @@ def check_evaluated(base: Base, spaces: Sequence[Space], metric: str) -> None:
         )
 
 
-def check_typed(base: Base, values: Values, typed: Mapping[str, Any]) -> Experiment:
-    """Returns the experiment with a point's values; UserError if they break a rule together."""
-    tree: dict[str, Any] = {}
-    for name, value in typed.items():
-        *path, last = name.replace("-", "_").split(".")
-        place = tree
-        for part in path:
-            place = place.setdefault(part, {})
-        place[last] = value
+def _check(base: Base, values: Values, typed: Mapping[str, Any]) -> None:
+    places: dict[Place, Any] = {
+        tuple(name.replace("-", "_").split(".")): value for name, value in typed.items()
+    }
     try:
-        return _replace(base.chosen, tree)
+        replaced(base.chosen, places)
     except Exception as error:  # a rule of a dataclass, of ours or the user's
         shown = " ".join(f"{name}={text}" for name, text in values.items())
         raise UserError(f"The point {shown}: {one_line(error)}") from error
-
-
-def _replace(value: Any, tree: Mapping[str, Any]) -> Any:
-    """Returns a dataclass's value with new fields, at any depth, each made only once."""
-    changed = {
-        name: _replace(getattr(value, name), new) if isinstance(new, dict) else new
-        for name, new in tree.items()
-    }
-    return dataclasses.replace(value, **changed)
 
 
 def option_words(base: Base, name: str, text: str) -> list[str]:
@@ -195,7 +180,7 @@ def job(base: Base, point: Point) -> Job:
         words += ["--num-seeds", str(base.seeds)]
         first = base.chosen.seed
         names = [f"{point.name}-seed{first + i}" for i in range(base.seeds)]
-    folders = tuple(base.folder / base.name / name for name in names)
+    folders = tuple(base.folder / base.source.name / name for name in names)
     return Job(point.name, tuple(words), folders, base.folder / "logs" / f"{point.name}.log")
 
 

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from purerl.core.errors import INTERRUPTED, SUCCESS, UserError
 from purerl.machine.files import make_folder
 from purerl.machine.lock import FolderLock
 from purerl.machine.output import printable, warn
+from purerl.machine.signals import handling
 from purerl.report import run_reader
 from purerl.runs import checkpoint_folder
 from purerl.runs.folder import CHECKPOINTS, read
@@ -190,17 +191,6 @@ def end(job: Job, code: int) -> Ended:
     return how_it_ended(job)
 
 
-@contextlib.contextmanager
-def _signals(pass_on: Callable[[int], None]) -> Iterator[None]:
-    """Calls `pass_on` at each signal that asks to stop."""
-    old = {n: signal.signal(n, lambda number, _: pass_on(number)) for n in PASSED_ON}
-    try:
-        yield
-    finally:
-        for number, handler in old.items():
-            signal.signal(number, handler)
-
-
 def carry_out(
     jobs: Iterable[Job],
     at_once: int,
@@ -224,7 +214,7 @@ def carry_out(
     received: list[int] = []
     todo = iter(jobs)
 
-    def pass_on(number: int) -> None:
+    def pass_on(number: int, frame: Any) -> None:
         if not received:
             name = signal.Signals(number).name
             warn(f"\n{name}: {len(active)} runs save and stop. Once more to stop them at once.")
@@ -245,7 +235,7 @@ def carry_out(
                 _send(process, received[0])
             began(job)
 
-    with _signals(pass_on):
+    with handling(PASSED_ON, pass_on):
         try:
             more = True
             while active or (more and not received):

@@ -11,7 +11,7 @@ from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, UserError
 from purerl.experiment.loading import Source
 from purerl.experiment.settings_json import to_json
 from purerl.experiment.source_hashes import PACKAGE, source_hashes
-from purerl.machine.files import check_object, make_folder, read_json, write_json
+from purerl.machine.files import check_object, make_folder, read_json, write_json, writing
 from purerl.machine.lock import FolderLock
 from purerl.machine.output import say, show, warn
 from purerl.runs import folder as run_folder, manifest
@@ -34,7 +34,7 @@ class Sweep(NamedTuple):
 def execute(arguments: Sequence[str]) -> int:
     """Checks the whole command, then carries it out; returns the exit code."""
     options, base, given = read(arguments)
-    swept = points.read_spaces(base, options.grid or options.over, given)
+    swept = points.read_spaces(base, options.swept, given)
     points.check_evaluated(base, swept, options.metric)
     sweep = Sweep(options, base, swept, [])
     if options.optuna:
@@ -72,14 +72,12 @@ def _begin(sweep: Sweep) -> Iterator[None]:
     """Makes the sweep's folder and locks it; UserError if it holds another sweep."""
     folder = sweep.base.folder
     file = folder / "sweep.json"
-    try:
+    with writing(folder):
         make_folder(folder)
         if not file.exists() and any(not one.name.startswith(".") for one in folder.iterdir()):
             raise UserError(f"{folder} holds no sweep, but other files; use another --name.")
         lock = _lock(folder)
-    except OSError as error:
-        raise UserError(f"{folder} cannot be written: {error.strerror}.") from error
-    try:
+    with contextlib.closing(lock):
         described = _describe(sweep)
         if file.exists():
             # An older version wrote less down, and goes on.
@@ -88,8 +86,6 @@ def _begin(sweep: Sweep) -> Iterator[None]:
             _check_code(sweep.base, begun["source"], described["source"])
         write_json(file, described)
         yield
-    finally:
-        lock.close()
 
 
 def _lock(folder: Path) -> FolderLock:
@@ -121,7 +117,9 @@ def _check_code(base: Base, begun: dict[str, Any], now: dict[str, str]) -> None:
     changed = [name for name in begun if now.get(name, begun[name]) != begun[name]]
     if not changed or base.options.allow_changes:
         return
-    if any(run_folder.read(folder).is_begun for folder in (base.folder / base.name).glob("*")):
+    if any(
+        run_folder.read(folder).is_begun for folder in (base.folder / base.source.name).glob("*")
+    ):
         more = f" and {len(changed) - 1} more" if changed[1:] else ""
         raise UserError(
             f"The experiment's code has changed since the sweep {base.folder} began: {changed[0]}"
@@ -152,7 +150,7 @@ def _describe(sweep: Sweep) -> dict[str, Any]:
         for space in sweep.spaces
     }
     how = "random" if options.random else "optuna" if options.optuna else "grid"
-    found = {"experiment": base.name, "settings": to_json(base.chosen), "swept": values}
+    found = {"experiment": base.source.name, "settings": to_json(base.chosen), "swept": values}
     found |= {"points": how, "seeds": options.seeds}
     # Options of the runs that alter their bits, or the steps that a line of metrics is about.
     found |= {n: getattr(base.options, n) for n in ("portable", "num_shards", "log_every")}

@@ -98,7 +98,8 @@ def submit(jobs: Sequence[Job], folder: Path, text: str, at_once: int) -> tuple[
         executor.update_parameters(**given)
     except Exception as error:  # its own, and of many kinds
         raise UserError(f"submitit: {one_line(error)}") from error
-    known = _known(place)
+    file = place / IDS
+    known = read_json(file) if file.exists() else {}
     open_ones = [job for job in jobs if not is_done(job)]
     todo = [
         job
@@ -111,13 +112,8 @@ def submit(jobs: Sequence[Job], folder: Path, text: str, at_once: int) -> tuple[
         except Exception as error:
             raise UserError(f"submitit: {one_line(error)}") from error
         ids = {job.name: one.job_id for job, one in zip(todo, submitted, strict=True)}
-        write_json(place / IDS, known | ids)
+        write_json(file, known | ids)
     return [job.name for job in todo], len(open_ones) - len(todo)
-
-
-def _known(place: Path) -> dict[str, str]:
-    file = place / IDS
-    return read_json(file) if file.exists() else {}
 
 
 def _is_queued(place: Path, cluster: Any, job_id: str | None) -> bool:

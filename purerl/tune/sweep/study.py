@@ -37,11 +37,8 @@ def open_study(folder: Path | None) -> Any:
 def known(study: Any, spaces: Sequence[Space]) -> list[Point]:
     """Returns the points chosen so far; one that a kill left half chosen is none."""
     names = {space.setting for space in spaces}
-    return [
-        Point(trial.number, {space.setting: _text(space, trial.params) for space in spaces})
-        for trial in study.get_trials(deepcopy=False)
-        if names == trial.params.keys()
-    ]
+    trials = study.get_trials(deepcopy=False)
+    return [_point(trial, spaces) for trial in trials if names == trial.params.keys()]
 
 
 def propose(study: Any, spaces: Sequence[Space], number: int) -> Iterator[Point]:
@@ -53,8 +50,8 @@ def propose(study: Any, spaces: Sequence[Space], number: int) -> Iterator[Point]
     yield from (point for point in known(study, spaces) if point.number in open_ones)
     while len(known(study, spaces)) < number:
         study.sampler = _sampler(len(study.get_trials(deepcopy=False)))
-        trial = study.ask(_distributions(spaces))
-        yield Point(trial.number, {s.setting: _text(s, trial.params) for s in spaces})
+        trial = study.ask({space.setting: _distribution(space) for space in spaces})
+        yield _point(trial, spaces)
 
 
 def tell(study: Any, point: Point, score: float) -> None:
@@ -74,24 +71,16 @@ def _sampler(seed: int) -> Any:
     return TPESampler(seed=seed, n_startup_trials=FIRST)
 
 
-def _distributions(spaces: Sequence[Space]) -> dict[str, Any]:
-    from optuna.distributions import (
-        CategoricalDistribution,
-        FloatDistribution,
-        IntDistribution,
-    )
+def _distribution(space: Space) -> Any:
+    from optuna import distributions as known
 
-    found: dict[str, Any] = {}
-    for space in spaces:
-        if space.choices:
-            found[space.setting] = CategoricalDistribution(space.choices)
-        elif space.whole:
-            ends = round(space.low), round(space.high)
-            found[space.setting] = IntDistribution(*ends, log=space.log)
-        else:
-            found[space.setting] = FloatDistribution(space.low, space.high, log=space.log)
-    return found
+    if space.choices:
+        return known.CategoricalDistribution(space.choices)
+    if space.whole:
+        return known.IntDistribution(round(space.low), round(space.high), log=space.log)
+    return known.FloatDistribution(space.low, space.high, log=space.log)
 
 
-def _text(space: Space, params: dict[str, Any]) -> str:
-    return str(params[space.setting])  # of a float every digit
+def _point(trial: Any, spaces: Sequence[Space]) -> Point:
+    # Of a float every digit.
+    return Point(trial.number, {s.setting: str(trial.params[s.setting]) for s in spaces})

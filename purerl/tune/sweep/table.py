@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import UserError
+from purerl.machine.files import writing
 from purerl.report import comparison, run_reader
 from purerl.report.seed_statistics import Group, check_scored, summarize
-from purerl.tune.sweep.points import Base, Point, job, read_value
+from purerl.tune.sweep.points import Base, Point, job, typed_values
 from purerl.tune.sweep.scheduler import how_it_ended, is_locked
 from purerl.tune.sweep.spaces import Space
 
@@ -28,10 +29,8 @@ class Row(NamedTuple):
 
 def make_rows(base: Base, points: Sequence[Point], metric: str) -> list[Row]:
     """Returns a row for each point, best first; numbers stand in the order of numbers."""
-    pairs = {pair for point in points for pair in point.values.items()}
-    read = {pair: read_value(base, *pair) for pair in sorted(pairs)}
     rows = []
-    for point in points:
+    for point, typed in zip(points, typed_values(base, points), strict=True):
         one = job(base, point)
         found = how_it_ended(one)
         status = found.status
@@ -39,7 +38,6 @@ def make_rows(base: Base, points: Sequence[Point], metric: str) -> list[Row]:
             status = "training"
         elif status == "stopped" and not one.log.exists():
             status = "waiting"
-        typed = {name: read[name, text] for name, text in point.values.items()}
         summary = summarize(group_of(base, point), metric)
         rows.append(Row(point, typed, status, found.said, summary))
     return sorted(rows, key=_rank)
@@ -140,9 +138,7 @@ def write(
     files = {kind: folder / f"sweep.{kind}" for kind in ("csv", "txt")}
     names = ["point", *(space.setting for space in spaces)]
     names += ["n", "iqm", "low", "high", "mean", "worst", "status", "said"]
-    try:
+    with writing(folder):
         comparison.write_csv(files["csv"], names, map(as_record, rows))
         files["txt"].write_text("\n".join(lines) + "\n", errors="backslashreplace")
-    except OSError as error:
-        raise UserError(f"{folder} cannot be written: {error.strerror}.") from error
     return files

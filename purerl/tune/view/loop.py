@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from purerl.checks.user_code import program_errors
 from purerl.core.errors import RunError, UserError, one_line
+from purerl.tune.option_numbers import label
 from purerl.tune.view import session as events
 from purerl.tune.view.opening import Source
-from purerl.tune.view.option_numbers import label
 from purerl.tune.view.session import Session, advance, to_build
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def _told(function: Callable[..., Any], *arguments: Any) -> Any:
     try:
         return function(*arguments)
     except Exception as error:  # a program, a file: whatever goes wrong is said in the page
-        return events.Failed(one_line(error))
+        return events.fail, one_line(error)
 
 
 def begin_work(session: Session, source: Source, beside: Beside) -> None:
@@ -81,12 +81,14 @@ def begin_work(session: Session, source: Source, beside: Beside) -> None:
         return
     if session.chosen:
         what = f"reading checkpoint {session.chosen}"
-        beside.begin(what, lambda name: events.Loaded(*source.brain(name)), session.chosen)
+        beside.begin(what, lambda name: (events.take_brain, *source.brain(name)), session.chosen)
     elif numbers := to_build(session):
         fixed = session.program.fixed
         changed = [f"{label(p)} = {numbers[p]:g}" for p in fixed if numbers[p] != fixed[p]]
         what = f"compiling with {', '.join(changed)}"
-        beside.begin(what, lambda values: events.Built(source.program(values)), dict(numbers))
+        beside.begin(
+            what, lambda values: (events.take_program, source.program(values)), dict(numbers)
+        )
 
 
 class Pace:
@@ -131,7 +133,7 @@ def play(
             watched = page.watched
             say(CAME if watched else LEFT)
         now = time.perf_counter()
-        tick = [events.Tick(min(now - last, LONGEST))] if watched else []
+        tick = [(events.tick, min(now - last, LONGEST))] if watched else []
         before, last = session, now
         session, failed = _advance(session, [*page.happened(), *beside.finished(), *tick])
         if failed:
@@ -155,7 +157,7 @@ def play(
 
 def _advance(session: Session, happened: list[Any]) -> tuple[Session, bool]:
     """Returns the session after the events, and whether something failed."""
-    failed = any(isinstance(event, events.Failed) for event in happened)
+    failed = any(event[0] is events.fail for event in happened)
     try:
         with program_errors():
             return advance(session, happened), failed

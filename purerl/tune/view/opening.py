@@ -19,10 +19,10 @@ from purerl.runs.folder import CHECKPOINTS, CODE
 from purerl.runs.loaded_run import Run
 from purerl.runs.restored_run import read_checkpoint
 from purerl.tune import overrides
+from purerl.tune.option_numbers import replaced
 from purerl.tune.plan import planner
 from purerl.tune.subject import Subject
 from purerl.tune.view.drivers import Driver, planner_driver, policy_driver
-from purerl.tune.view.option_numbers import replaced
 from purerl.tune.view.program import Numbers, build_program
 from purerl.tune.view.session import Session, open_session
 
@@ -92,7 +92,8 @@ def _of_experiment(
     setup, written = build(chosen), subject.source.experiment
     driver = planner_driver(options, lambda _: planner.unguided(setup.env.action_size), ())
     source = _source(setup, driver, (), written, chosen, subject.name)
-    return _open(source, setup, (), _plans(options), options), source, subject.source.name
+    words = f"{options.planner}, {options.samples} plans of {options.horizon} steps"
+    return _open(source, setup, (), words, options), source, subject.source.name
 
 
 def _source(
@@ -142,10 +143,6 @@ def _open(source: Source, setup: Setup, brain: Any, words: str, options: Any) ->
 
 def _words(update: int, steps: int) -> str:
     return f"policy of update {update:,} ({steps:,} steps)"
-
-
-def _plans(options: Any) -> str:
-    return f"{options.planner}, {options.samples} plans of {options.horizon} steps"
 
 
 def checkpoint_names(folder: Path, first: str) -> list[str]:

@@ -11,13 +11,13 @@ from typing import Any
 
 import viser
 
+from purerl.tune.option_numbers import Place, bounds, label
 from purerl.tune.view import readouts, session as events
-from purerl.tune.view.option_numbers import Place, bounds, label
 from purerl.tune.view.scene import Scene
 from purerl.tune.view.session import Session
 
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
-MOVES = {"Step": events.Step, "Next episode": events.Next}
+MOVES = {"Step": events.step, "Next episode": events.next_episode}
 WAYS = {"forward": (1, 0, 0), "back": (-1, 0, 0), "left": (0, 1, 0), "right": (0, -1, 0),
         "up": (0, 0, 1)}  # fmt: skip
 COLORS = ("#222222", "#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b")
@@ -39,7 +39,7 @@ class Page:
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
             self.server = viser.ViserServer(host, port, label=title, verbose=False)
         self.server.gui.configure_theme(show_share_button=False, control_width="large")
-        self.scene = Scene(self.server, self.events.put)
+        self.scene = Scene(self.server, self.put)
         self.sliders: dict[Place, Any] = {}
         self.numbers: dict[Place, Any] = {}  # as the sliders have told them
         self.plots: dict[str, Any] = {}
@@ -60,6 +60,10 @@ class Page:
         """Ends the server."""
         self.server.stop()
 
+    def put(self, *event: Any) -> None:
+        """Notes an event of `session.py`: a function, and what it takes."""
+        self.events.put(event)
+
     def happened(self) -> list[Any]:
         """Returns the events since the last call."""
         return [self.events.get() for _ in range(self.events.qsize())]
@@ -71,26 +75,26 @@ class Page:
           session: the session.
           checkpoints: names to choose among, the first being in use; none: nothing to choose.
         """
-        gui, put = self.server.gui, self.events.put
+        gui, put = self.server.gui, self.put
         self.play = gui.add_button("Pause")
-        self.play.on_click(lambda _: put(events.Play(self.play.label == "Play")))
+        self.play.on_click(lambda _: put(events.play, self.play.label == "Play"))
         moves = gui.add_button_group("Move on", tuple(MOVES))
-        moves.on_click(lambda _: put(MOVES[moves.value]()))
+        moves.on_click(lambda _: put(MOVES[moves.value]))
         speed = gui.add_dropdown(
             "Speed", SPEEDS, initial_value="1", hint="Simulated seconds in a real one"
         )
-        speed.on_update(lambda _: put(events.Speed(float(speed.value))))
+        speed.on_update(lambda _: put(events.speed, float(speed.value)))
         follow = gui.add_checkbox("Camera follows", True)
         follow.on_update(lambda _: setattr(self.scene, "follows", follow.value))
         shadows = gui.add_checkbox("Shadows", True, hint="Without: faster where there is no GPU")
         shadows.on_update(lambda _: self.scene.cast_shadows(shadows.value))
         seed = gui.add_number("Seed", session.seed, min=0, max=2**32 - 1, step=1)
-        seed.on_update(lambda _: put(events.Seed(int(seed.value))))
+        seed.on_update(lambda _: put(events.seed, int(seed.value)))
         if checkpoints:
             self.checkpoints = gui.add_dropdown(
                 "Checkpoint", tuple(checkpoints), initial_value=checkpoints[0]
             )
-            self.checkpoints.on_update(lambda _: put(events.Choose(self.checkpoints.value)))
+            self.checkpoints.on_update(lambda _: put(events.choose, self.checkpoints.value))
         self._add_sliders(session)
         self._add_push()
         self._add_plots()
@@ -104,7 +108,7 @@ class Page:
             @gui.add_button("Push").on_click
             def _(_: Any) -> None:
                 x, y, z = (hard.value * part for part in WAYS[way.value])
-                self.events.put(events.Push((x, y, z)))
+                self.put(events.push, (x, y, z))
 
     def _add_sliders(self, session: Session) -> None:
         gui, live = self.server.gui, session.program.live
@@ -132,7 +136,7 @@ class Page:
         """Tells a slider's move, but for one that `set_sliders` made."""
         if value != self.numbers[place]:
             self.numbers[place] = value
-            self.events.put(events.Slide(place, value))
+            self.put(events.slide, place, value)
 
     def _add_plots(self) -> None:
         panel = self.server.gui.add_panel()

@@ -22,8 +22,9 @@ from purerl.core.records import Array, PyTree
 from purerl.devices.compilation import jit, start as compile_beside
 from purerl.ppo.episodes import is_lost
 from purerl.report.episode_pictures import Picture, take_picture
+from purerl.report.renderer import model_of
+from purerl.tune.option_numbers import Place, numbers_of, replaced
 from purerl.tune.view.drivers import Driver
-from purerl.tune.view.option_numbers import Place, numbers_of, replaced
 
 Numbers = Mapping[Place, int | float]
 
@@ -132,11 +133,7 @@ def _on_host(moment: Moment, shown: Any) -> tuple[Moment, Any]:
 
 
 def _check(env: Any, observed: PyTree) -> None:
-    if not hasattr(getattr(env, "physics", None), "model"):
-        raise UserError(
-            f"The environment {type(env).__name__} cannot be drawn: it has no `physics` of the "
-            "type purerl.Physics."
-        )
+    model_of(env)
     given = jax.eval_shape(env.reset, jax.random.key(0)).observation
     given, wanted = (jax.tree.map(lambda x: list(x.shape), tree) for tree in (given, observed))
     if observed is not None and given != wanted:

@@ -7,11 +7,10 @@ instead, so that a person can turn the camera meanwhile, and one message a frame
 from collections.abc import Callable
 from typing import Any
 
-import mujoco
 import numpy as np
 import viser
 
-from purerl.report.renderer import root_body
+from purerl.report.renderer import Stage
 from purerl.tune.view import session as events, shapes
 from purerl.tune.view.session import Session
 
@@ -22,7 +21,7 @@ GROUND_COLOR = (225, 230, 235)
 class Scene:
     """The drawn model of one program."""
 
-    def __init__(self, server: viser.ViserServer, put: Callable[[Any], None]) -> None:
+    def __init__(self, server: viser.ViserServer, put: Callable[..., None]) -> None:
         """Prepares an empty scene; what the mouse does to the body becomes events, given to put."""
         self.server, self.put = server, put
         self.follows, self.offset = True, np.zeros(3)
@@ -39,9 +38,9 @@ class Scene:
         if not first:
             self.world.remove()  # with all below it
         self.world = self.server.scene.add_frame(WORLD, show_axes=False)
-        self.model = model = shapes.drawable(session.program.env.physics.model)
-        self.data, self.root = mujoco.MjData(model), root_body(model)
-        shapes.pose(model, self.data, session.picture)
+        self.stage = Stage(session.program.env.physics.model)
+        self.model, self.data = model, _ = self.stage.model, self.stage.data
+        shapes.pose(self.stage, session.picture)
         self.batches = shapes.batches(model)
         self.drawn = {n: shapes.layout(model, self.data, b) for n, b in self.batches.items()}
         self.handles = {name: self._add_batch(name) for name in self.batches}
@@ -63,7 +62,7 @@ class Scene:
         if session.picture is self.seen:
             return
         self.seen = session.picture
-        shapes.pose(self.model, self.data, session.picture)
+        shapes.pose(self.stage, session.picture)
         with self.server.atomic():
             for name, batch in self.batches.items():
                 where = shapes.layout(self.model, self.data, batch)
@@ -71,7 +70,7 @@ class Scene:
                 self.drawn[name] = where
             self._draw_scenery(shapes.scenery_layout(session.picture))
             if self.follows:
-                self.offset = np.append(self.data.subtree_com[self.root][:2], 0.0)
+                self.offset = np.append(self.data.subtree_com[self.stage.root][:2], 0.0)
                 self.world.position = -self.offset
 
     def _add_batch(self, name: str) -> Any:
@@ -94,11 +93,11 @@ class Scene:
     def _dragged(self, batch: shapes.Batch, event: Any) -> None:
         """Tells that the mouse draws at a part of a body, or lets it go."""
         if event.phase == "end":
-            self.put(events.Release())
+            self.put(events.release)
             return
         start, end = (np.array(p) + self.offset for p in (event.start_position, event.end_position))
         geom = batch.geoms[event.instance_index or 0]
-        self.put(events.Pull(int(self.model.geom_bodyid[geom]), start, end))
+        self.put(events.pull, int(self.model.geom_bodyid[geom]), start, end)
 
     def _draw_scenery(self, where: shapes.Layout | None) -> None:
         """Draws an episode's boxes, which stand still: they are sent once."""
@@ -110,19 +109,20 @@ class Scene:
             self.boxes.remove()
         self.boxes = None
         if where is not None:
+            box = shapes.UNIT_MESHES[shapes.BOX]
             self.boxes = self.server.scene.add_batched_meshes_simple(
-                f"{WORLD}/scenery", *shapes.unit_box(), where.wxyzs, where.positions,
+                f"{WORLD}/scenery", box.vertices, box.faces, where.wxyzs, where.positions,
                 batched_scales=where.scales, lod="off",
                 batched_colors=shapes.as_light(shapes.SCENERY_COLOR),
             )  # fmt: skip
 
     def _aim(self) -> None:
         """Sets the camera that a browser begins with: from the side, as far as the body is big."""
-        own = self.model.body_rootid[self.model.geom_bodyid] == self.root
-        center = self.data.subtree_com[self.root]
-        away = np.linalg.norm(self.data.geom_xpos[own] - center, axis=1)
-        radius = float(np.max(away + self.model.geom_rbound[own], initial=0.05))
-        camera, height = self.server.initial_camera, float(center[2])
+        radius = self.stage.radius(0.05)
+        camera, height = (
+            self.server.initial_camera,
+            float(self.data.subtree_com[self.stage.root][2]),
+        )
         camera.look_at = (0.0, 0.0, height)
         camera.position = (-0.6 * radius, -2.4 * radius, height + 0.9 * radius)
         camera.near = radius / 100

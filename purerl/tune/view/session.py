@@ -1,9 +1,9 @@
 """What the window shows, as a record; `advance(session, events) -> session` is all that happens.
 
-The page and the clock make events. Nothing here waits, draws or reads a file.
+The page and the clock make events: functions of the session, with what they take besides. Nothing
+here waits, draws or reads a file.
 """
 
-import functools
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -11,8 +11,8 @@ import numpy as np
 
 from purerl.report.episode_pictures import Picture
 from purerl.report.renderer import root_body
-from purerl.tune.view import push
-from purerl.tune.view.option_numbers import Place
+from purerl.tune.option_numbers import Place
+from purerl.tune.view import push as pushes
 from purerl.tune.view.program import Moment, Program, Shown, episode_key
 
 SECONDS_KEPT = 8.0  # of an episode, for the plots [s]
@@ -51,94 +51,12 @@ class Session(NamedTuple):
     playing: bool = True
     speed: float = 1.0
     owed: float = 0.0  # simulated time that is still to be played [s]
-    grip: push.Grip | None = None
+    grip: pushes.Grip | None = None
     chosen: str = ""  # a checkpoint that has yet to be read
     # What is said.
     ended: str = ""  # how the last episode ended
     trouble: str = ""
     instant: int = 0  # episodes in a row that ended at once
-
-
-class Play(NamedTuple):
-    """Play, or pause."""
-
-    on: bool
-
-
-class Step(NamedTuple):
-    """One control step, and then a pause."""
-
-
-class Speed(NamedTuple):
-    """How many simulated seconds pass in one of the clock."""
-
-    factor: float
-
-
-class Next(NamedTuple):
-    """Start the next episode."""
-
-
-class Seed(NamedTuple):
-    """Start the first episode of another seed."""
-
-    seed: int
-
-
-class Choose(NamedTuple):
-    """Take another checkpoint: latest, best, or an update's number."""
-
-    name: str
-
-
-class Slide(NamedTuple):
-    """Another number in the options."""
-
-    place: Place
-    value: int | float
-
-
-class Push(NamedTuple):
-    """Change the velocity of the body's root."""
-
-    dv: tuple[float, float, float]  # [m/s]
-
-
-class Pull(NamedTuple):
-    """Hold a body at `start` and draw it to `target`, both in the world [m]."""
-
-    body: int
-    start: Any  # [3]
-    target: Any  # [3]
-
-
-class Release(NamedTuple):
-    """Let go."""
-
-
-class Tick(NamedTuple):
-    """So much time has passed on the clock [s]."""
-
-    seconds: float
-
-
-class Built(NamedTuple):
-    """A program for other numbers is ready."""
-
-    program: Program
-
-
-class Loaded(NamedTuple):
-    """A checkpoint has been read."""
-
-    brain: Any
-    checkpoint: str
-
-
-class Failed(NamedTuple):
-    """What was asked for could not be had, in one line."""
-
-    why: str
 
 
 def open_session(program: Program, brain: Any, checkpoint: str, limit: int, seed: int) -> Session:
@@ -155,47 +73,29 @@ def to_build(session: Session) -> dict[Place, int | float] | None:
     return None if wanted == fixed else session.numbers
 
 
-def advance(session: Session, events: Iterable[Any]) -> Session:
+Event = tuple[Any, ...]  # a function of this section, and what it takes after the session
+
+
+def advance(session: Session, events: Iterable[Event]) -> Session:
     """Returns the session after these events, in order."""
-    return functools.reduce(_after, events, session)
+    for event in events:
+        if not isinstance(event, tuple):
+            raise TypeError(f"{type(event).__name__} is no event of a session.")
+        happen, *about = event
+        session = happen(session, *about)
+    return session
 
 
-def _after(session: Session, event: Any) -> Session:
-    match event:
-        case Tick(seconds):
-            return _play(session, seconds) if session.playing else session
-        case Play(on):
-            return session._replace(playing=on, owed=0.0, instant=0, trouble="")
-        case Step():
-            return take_step(session._replace(playing=False, owed=0.0))
-        case Speed(factor):
-            return session._replace(speed=factor)
-        case Next():
-            return start_episode(session, session.episode + 1)
-        case Seed(seed):
-            return start_episode(session._replace(seed=seed), 0)
-        case Choose(name):
-            return session._replace(chosen=name)
-        case Slide(place, value):
-            return session._replace(numbers=session.numbers | {place: value}, trouble="")
-        case Push(dv):
-            return _pushed(session, dv)
-        case Pull():
-            return _held(session, event)
-        case Release():
-            return session._replace(grip=None)
-        case Built(program):
-            return start_episode(session._replace(program=program), session.episode)
-        case Loaded(brain, checkpoint):
-            return session._replace(brain=brain, checkpoint=checkpoint, chosen="", trouble="")
-        case Failed(why):
-            numbers = session.numbers | session.program.fixed
-            return session._replace(trouble=why, numbers=numbers, chosen="")
-    raise TypeError(f"{type(event).__name__} is no event of a session.")
+# --- events ---
 
 
-def _play(session: Session, seconds: float) -> Session:
-    """Takes the steps that are due; what a slow computer owes beyond MOST_OWED is forgiven."""
+def tick(session: Session, seconds: float) -> Session:
+    """So much time has passed on the clock [s]: takes the steps that are due.
+
+    What a slow computer owes beyond MOST_OWED is forgiven.
+    """
+    if not session.playing:
+        return session
     timestep = session.program.env.control_timestep
     most = max(MOST_OWED * session.speed, timestep)
     session = session._replace(owed=min(session.owed + seconds * session.speed, most))
@@ -203,6 +103,82 @@ def _play(session: Session, seconds: float) -> Session:
     while session.playing and session.owed >= due:
         session = take_step(session._replace(owed=max(0.0, session.owed - timestep)))
     return session
+
+
+def play(session: Session, on: bool) -> Session:
+    """Plays, or pauses."""
+    return session._replace(playing=on, owed=0.0, instant=0, trouble="")
+
+
+def step(session: Session) -> Session:
+    """Takes one control step, and then pauses."""
+    return take_step(session._replace(playing=False, owed=0.0))
+
+
+def speed(session: Session, factor: float) -> Session:
+    """Lets so many simulated seconds pass in one of the clock."""
+    return session._replace(speed=factor)
+
+
+def next_episode(session: Session) -> Session:
+    """Starts the next episode."""
+    return start_episode(session, session.episode + 1)
+
+
+def seed(session: Session, seed: int) -> Session:
+    """Starts the first episode of another seed."""
+    return start_episode(session._replace(seed=seed), 0)
+
+
+def choose(session: Session, name: str) -> Session:
+    """Asks for another checkpoint: latest, best, or an update's number."""
+    return session._replace(chosen=name)
+
+
+def slide(session: Session, place: Place, value: int | float) -> Session:
+    """Takes another number in the options."""
+    return session._replace(numbers=session.numbers | {place: value}, trouble="")
+
+
+def push(session: Session, dv: tuple[float, float, float]) -> Session:
+    """Changes the velocity of the body's root by `dv` [m/s]."""
+    model, data = session.program.env.physics.model, _place(session)
+    root = root_body(model)
+    return _with_velocity(session, pushes.push(model, data, root, data.subtree_com[root], dv))
+
+
+def pull(session: Session, body: int, start: Any, target: Any) -> Session:
+    """Holds a body at `start` and draws it to `target`, both [3] in the world [m].
+
+    Of a body that is held already, the target moves.
+    """
+    if session.grip is not None and session.grip.body == body:
+        return session._replace(grip=session.grip._replace(target=np.asarray(target)))
+    return session._replace(grip=pushes.grip(_place(session), body, start, target))
+
+
+def release(session: Session) -> Session:
+    """Lets go."""
+    return session._replace(grip=None)
+
+
+def take_program(session: Session, program: Program) -> Session:
+    """Takes a program for other numbers, which is ready."""
+    return start_episode(session._replace(program=program), session.episode)
+
+
+def take_brain(session: Session, brain: Any, checkpoint: str) -> Session:
+    """Takes what was learned, of a checkpoint that has been read."""
+    return session._replace(brain=brain, checkpoint=checkpoint, chosen="", trouble="")
+
+
+def fail(session: Session, why: str) -> Session:
+    """Tells, in one line, why what was asked for could not be had, and takes it back."""
+    numbers = session.numbers | session.program.fixed
+    return session._replace(trouble=why, numbers=numbers, chosen="")
+
+
+# --- episodes ---
 
 
 def start_episode(session: Session, episode: int) -> Session:
@@ -219,7 +195,7 @@ def take_step(session: Session) -> Session:
     timestep = session.program.env.control_timestep
     if session.grip is not None:
         data = _place(session)
-        dqvel = push.pull(session.program.env.physics.model, data, session.grip, timestep)
+        dqvel = pushes.pull(session.program.env.physics.model, data, session.grip, timestep)
         session = _with_velocity(session, dqvel)
     moment, shown = session.program.step(session.numbers, session.brain, session.moment)
     length = session.length + 1
@@ -275,20 +251,7 @@ def _finished(session: Session, why: str, timestep: float) -> Session:
 
 def _place(session: Session) -> Any:
     physics = session.moment.env.physics
-    return push.place(session.program.env.physics.model, physics.qpos, physics.qvel)
-
-
-def _pushed(session: Session, dv: tuple[float, float, float]) -> Session:
-    model, data = session.program.env.physics.model, _place(session)
-    root = root_body(model)
-    return _with_velocity(session, push.push(model, data, root, data.subtree_com[root], dv))
-
-
-def _held(session: Session, event: Pull) -> Session:
-    """Moves the pointer of a hold, or takes a new one."""
-    if session.grip is not None and session.grip.body == event.body:
-        return session._replace(grip=session.grip._replace(target=np.asarray(event.target)))
-    return session._replace(grip=push.grip(_place(session), *event))
+    return pushes.place(session.program.env.physics.model, physics.qpos, physics.qvel)
 
 
 def _with_velocity(session: Session, dqvel: np.ndarray) -> Session:

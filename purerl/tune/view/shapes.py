@@ -8,12 +8,14 @@ meshes anew: 0.3 s for an ant, 0.9 s for a rodent, against 0.2 ms, as
 lab/2026-11-23-window-beside-mjviser.md has it.)
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
+import trimesh
 
 from purerl.report.episode_pictures import Picture
+from purerl.report.renderer import Stage
 
 SPHERE, ROD, BOX = "sphere", "rod", "box"
 _GEOM = mujoco.mjtGeom
@@ -24,21 +26,21 @@ _PARTS = {  # a capsule is a rod and two spheres: it cannot be stretched as a wh
     int(_GEOM.mjGEOM_CYLINDER): (ROD,),
     int(_GEOM.mjGEOM_BOX): (BOX,),
 }
+# From -1 to 1 along each axis. `smooth_shaded` gives the sides of an edge corners of their own, so
+# that it is seen to be sharp.
+UNIT_MESHES = {
+    SPHERE: trimesh.creation.icosphere(subdivisions=3),
+    ROD: trimesh.creation.cylinder(radius=1.0, height=2.0, sections=24).smooth_shaded,
+    BOX: trimesh.creation.box(extents=(2.0, 2.0, 2.0)).smooth_shaded,
+}
 SHOWN_GROUPS = 3  # MuJoCo's own viewers show geoms of groups 0, 1 and 2
 SCENERY_COLOR = np.array([102, 115, 128])
-
-
-class Mesh(NamedTuple):
-    """A surface: vertices [V, 3] [m], faces [F, 3] of them."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
 
 
 class Batch(NamedTuple):
     """One mesh that stands for N parts of geoms."""
 
-    mesh: Mesh
+    mesh: trimesh.Trimesh
     shape: str  # SPHERE, ROD, BOX, or a mesh's name
     geoms: np.ndarray  # [N] int
     sides: np.ndarray  # [N] of a capsule's spheres: 1 above, -1 below; 0 in the middle
@@ -55,21 +57,11 @@ class Layout(NamedTuple):
     scales: np.ndarray  # [N, 3]
 
 
-def drawable(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Returns a copy of a model that heeds changed places of geoms (see `report.renderer`)."""
-    model = mujoco.MjModel.__copy__(model)
-    model.geom_sameframe[:] = model.site_sameframe[:] = model.body_sameframe[:] = 0
-    return model
-
-
-def pose(model: mujoco.MjModel, data: mujoco.MjData, picture: Picture) -> None:
-    """Puts a `drawable` model into the place and form of a picture."""
-    for name, values in picture.changes.items():
-        getattr(model, name)[...] = values
-    data.qpos[:] = picture.qpos
-    data.mocap_pos[:], data.mocap_quat[:] = picture.mocap_pos, picture.mocap_quat
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
+def pose(stage: Stage, picture: Picture) -> None:
+    """Puts a stage's model into the place and form of a picture."""
+    stage.put(picture)
+    mujoco.mj_kinematics(stage.model, stage.data)
+    mujoco.mj_comPos(stage.model, stage.data)
 
 
 def batches(model: mujoco.MjModel) -> dict[str, Batch]:
@@ -172,62 +164,10 @@ def _quaternions(rotations: np.ndarray) -> np.ndarray:
     return found
 
 
-def _mesh(model: mujoco.MjModel, name: str) -> Mesh:
-    unit: dict[str, Any] = {SPHERE: unit_sphere, ROD: unit_rod, BOX: unit_box}
-    if name in unit:
-        return unit[name]()
+def _mesh(model: mujoco.MjModel, name: str) -> trimesh.Trimesh:
+    if name in UNIT_MESHES:
+        return UNIT_MESHES[name]
     mesh = int(name.removeprefix("mesh"))
     vertices = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
     faces = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
-    return Mesh(
-        np.asarray(model.mesh_vert[vertices], np.float32),
-        np.asarray(model.mesh_face[faces], np.uint32),
-    )
-
-
-def _float_mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    return Mesh(np.asarray(vertices, np.float32), np.asarray(faces, np.uint32))
-
-
-def unit_sphere(rings: int = 12) -> Mesh:
-    """Returns a sphere of radius 1."""
-    polar, around = np.linspace(0, np.pi, rings + 1), np.linspace(0, 2 * np.pi, 2 * rings + 1)
-    polar, around = np.meshgrid(polar, around, indexing="ij")
-    points = [np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)]
-    return Mesh(
-        np.asarray(np.stack(points, -1).reshape(-1, 3), np.float32), _grid_faces(*polar.shape)
-    )
-
-
-def unit_rod(sides: int = 24) -> Mesh:
-    """Returns a cylinder of radius 1 from z = -1 to 1, with lids."""
-    around = np.linspace(0, 2 * np.pi, sides + 1)
-    x, y = np.cos(around), np.sin(around)
-    rows = [(0, 1), (1, 1), (1, 1), (1, -1), (1, -1), (0, -1)]  # radius and z; edges stay sharp
-    points = [np.stack([r * x, r * y, np.full_like(x, z)], -1) for r, z in rows]
-    faces = _grid_faces(len(rows), sides + 1)[_sound(sides)]
-    return _float_mesh(np.concatenate(points), faces)
-
-
-def _sound(sides: int) -> np.ndarray:
-    """Returns which faces of the rod's five bands to keep: the two between equal rows are flat."""
-    return np.repeat([True, False, True, False, True], 2 * sides)
-
-
-def unit_box() -> Mesh:
-    """Returns a box from -1 to 1, each side with corners of its own, so that edges are sharp."""
-    square = np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], np.float32)
-    turns = [np.roll(square, shift, axis=1) * sign for shift in (0, 1, 2) for sign in (1, -1)]
-    faces = [
-        np.array([[0, 1, 2], [0, 2, 3]])[:, :: -1 if number % 2 else 1] + 4 * number
-        for number in range(6)
-    ]
-    return _float_mesh(np.concatenate(turns), np.concatenate(faces))
-
-
-def _grid_faces(rows: int, columns: int) -> np.ndarray:
-    """Returns the triangles of a surface of rows x columns vertices, seen from outside."""
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-    first = np.stack([corner, corner + columns, corner + columns + 1], -1)
-    second = np.stack([corner, corner + columns + 1, corner + 1], -1)
-    return np.asarray(np.stack([first, second], 1).reshape(-1, 3), np.uint32)
+    return trimesh.Trimesh(model.mesh_vert[vertices], model.mesh_face[faces], process=False)

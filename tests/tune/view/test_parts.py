@@ -12,10 +12,10 @@ from purerl import UserError
 from purerl.envs import run
 from purerl.experiment.command_line import from_command_line
 from purerl.experiment.loading import find_source
-from purerl.report.episode_pictures import Picture
+from purerl.physics.drawing import Picture, Stage
 from purerl.tune import overrides
+from purerl.tune.option_numbers import bounds, label, numbers_of, replaced
 from purerl.tune.view import loop, opening, push, shapes
-from purerl.tune.view.option_numbers import bounds, label, numbers_of, replaced
 
 # --- numbers ---
 
@@ -123,10 +123,11 @@ def test_a_pull_draws_the_grip_to_the_pointer_and_settles():
 
 
 @pytest.mark.parametrize(
-    ("mesh", "volume"),
-    [(shapes.unit_sphere(), 4 / 3 * np.pi), (shapes.unit_rod(), 2 * np.pi), (shapes.unit_box(), 8)],
+    ("shape", "volume"),
+    [(shapes.SPHERE, 4 / 3 * np.pi), (shapes.ROD, 2 * np.pi), (shapes.BOX, 8)],
 )
-def test_meshes_are_closed_and_seen_from_outside(mesh, volume):
+def test_meshes_are_closed_and_seen_from_outside(shape, volume):
+    mesh = shapes.UNIT_MESHES[shape]
     a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(float) for i in range(3))
     assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6 == pytest.approx(volume, rel=0.05)
     assert np.abs(mesh.vertices).max() == pytest.approx(1.0)
@@ -134,9 +135,9 @@ def test_meshes_are_closed_and_seen_from_outside(mesh, volume):
 
 def test_a_capsule_is_a_rod_between_two_spheres():
     capsule = '<geom type="capsule" size="0.1 0.5" euler="0 90 0" pos="0 0 1"/>'
-    model = shapes.drawable(model_of(f"<body><freejoint/>{capsule}</body>"))
-    data = mujoco.MjData(model)
-    shapes.pose(model, data, Picture(model.qpos0, np.zeros((0, 3)), np.zeros((0, 4)), {}, ()))
+    stage = Stage(model_of(f"<body><freejoint/>{capsule}</body>"))
+    model, data = stage.model, stage.data
+    shapes.pose(stage, Picture(model.qpos0, np.zeros((0, 3)), np.zeros((0, 4)), {}, ()))
     found = shapes.batches(model)
     assert set(found) == {"body/rod", "body/sphere"}
     balls = shapes.layout(model, data, found["body/sphere"])
@@ -148,16 +149,14 @@ def test_a_capsule_is_a_rod_between_two_spheres():
 
 
 def test_an_episodes_own_boxes_are_where_its_physics_has_them():
-    model = shapes.drawable(run.build(run.Options(arena="gaps"), "c").physics.model)
-    data, found = mujoco.MjData(model), shapes.batches(model)["ground/box"]
+    stage = Stage(run.build(run.Options(arena="gaps"), "c").physics.model)
+    model, data, found = stage.model, stage.data, shapes.batches(stage.model)["ground/box"]
     drawn = []
     for x, half in ((7.0, 0.9), (9.0, 0.4)):
         position, size = model.geom_pos.copy(), model.geom_size.copy()
         position[found.geoms[1], 0], size[found.geoms[1], 0] = x, half
         changes = {"geom_pos": position, "geom_size": size}
-        shapes.pose(
-            model, data, Picture(model.qpos0, np.zeros((0, 3)), np.zeros((0, 4)), changes, ())
-        )
+        shapes.pose(stage, Picture(model.qpos0, np.zeros((0, 3)), np.zeros((0, 4)), changes, ()))
         drawn.append(shapes.layout(model, data, found))
     assert [float(each.positions[1, 0]) for each in drawn] == [7.0, 9.0]
     assert [float(each.scales[1, 0]) for each in drawn] == [np.float32(0.9), np.float32(0.4)]

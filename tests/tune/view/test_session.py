@@ -61,53 +61,53 @@ def opened(*arguments, limit: int = 1000, **more) -> s.Session:
 def test_steps_are_taken_as_time_passes():
     session = opened()
     for _ in range(10):
-        session = s.advance(session, [s.Tick(0.03)])
+        session = s.advance(session, [(s.tick, 0.03)])
     assert session.length == 15 and session.picture.qpos[0] == 15
-    assert s.advance(session._replace(speed=0.5), [s.Tick(0.04)]).length == 16
-    assert s.advance(session, [s.Speed(2.0), s.Tick(0.04)]).length == 19
+    assert s.advance(session._replace(speed=0.5), [(s.tick, 0.04)]).length == 16
+    assert s.advance(session, [(s.speed, 2.0), (s.tick, 0.04)]).length == 19
 
 
 def test_a_slow_computer_owes_no_more_than_a_moment():
-    assert s.advance(opened(), [s.Tick(60.0)]).length == round(s.MOST_OWED / TIMESTEP)
+    assert s.advance(opened(), [(s.tick, 60.0)]).length == round(s.MOST_OWED / TIMESTEP)
 
 
 def test_pause_step_and_play():
-    session = s.advance(opened(), [s.Play(False), s.Tick(0.1)])
+    session = s.advance(opened(), [(s.play, False), (s.tick, 0.1)])
     assert session.length == 0
-    session = s.advance(session, [s.Step(), s.Tick(0.1)])
+    session = s.advance(session, [(s.step,), (s.tick, 0.1)])
     assert session.length == 1 and not session.playing
-    assert s.advance(session, [s.Play(True), s.Tick(0.02)]).length == 2
-    assert s.advance(opened(), [s.Tick(0.05), s.Step()]).playing is False
+    assert s.advance(session, [(s.play, True), (s.tick, 0.02)]).length == 2
+    assert s.advance(opened(), [(s.tick, 0.05), (s.step,)]).playing is False
 
 
 # --- episodes ---
 
 
 def test_an_episode_ends_and_the_next_begins():
-    session = s.advance(opened(3), [s.Tick(0.1)])
+    session = s.advance(opened(3), [(s.tick, 0.1)])
     assert session.episode == 1 and session.length == 2 and session.playing
     assert session.ended == "Episode 0 ended after 0.06 s (terminated), return 6."
-    assert "time limit" in s.advance(opened(limit=4), [s.Tick(0.1)]).ended
+    assert "time limit" in s.advance(opened(limit=4), [(s.tick, 0.1)]).ended
 
 
 def test_a_lost_step_is_neither_drawn_nor_counted():
-    session = s.advance(opened(3, lost=True), [s.Tick(0.06)])
+    session = s.advance(opened(3, lost=True), [(s.tick, 0.06)])
     assert "NaN or absurd" in session.ended and "return 4." in session.ended
 
 
 def test_an_environment_that_ends_at_once_stops_the_window():
-    session = s.advance(opened(1), [s.Tick(0.1), s.Tick(0.1)])
+    session = s.advance(opened(1), [(s.tick, 0.1), (s.tick, 0.1)])
     assert session.episode == s.INSTANT and not session.playing
     assert "ends at its first step (terminated)" in session.trouble
     assert session.trouble.count("\n") == 0
-    again = s.advance(session, [s.Play(True), s.Tick(0.1)])
+    again = s.advance(session, [(s.play, True), (s.tick, 0.1)])
     assert again.episode == 2 * s.INSTANT and not again.playing  # tried anew, told anew
 
 
 def test_next_and_seed_start_other_episodes(monkeypatch):
     keys = []
     monkeypatch.setattr(s, "episode_key", lambda seed, episode: keys.append((seed, episode)))
-    session = s.advance(opened(), [s.Tick(0.1), s.Next(), s.Tick(0.1), s.Seed(9)])
+    session = s.advance(opened(), [(s.tick, 0.1), (s.next_episode,), (s.tick, 0.1), (s.seed, 9)])
     assert keys == [(3, 0), (3, 1), (9, 0)]
     assert session.length == 0 and session.rows == () and session.sums == {}
 
@@ -116,32 +116,34 @@ def test_next_and_seed_start_other_episodes(monkeypatch):
 
 
 def test_a_live_number_acts_in_the_next_step():
-    session = s.advance(opened(), [s.Step(), s.Slide(WEIGHT, 5.0), s.Step()])
+    session = s.advance(opened(), [(s.step,), (s.slide, WEIGHT, 5.0), (s.step,)])
     assert [row.reward for row in session.rows] == [2.0, 5.0]
     assert s.to_build(session) is None
 
 
 def test_another_number_waits_for_its_program():
-    session = s.advance(opened(), [s.Tick(0.1), s.Slide(WIDTH, 0.7)])
+    session = s.advance(opened(), [(s.tick, 0.1), (s.slide, WIDTH, 0.7)])
     assert s.to_build(session) == {WEIGHT: 2.0, WIDTH: 0.7}
-    assert s.advance(session, [s.Step()]).length == 6  # the old one plays on
-    session = s.advance(session, [s.Built(program(width=0.7))])
+    assert s.advance(session, [(s.step,)]).length == 6  # the old one plays on
+    session = s.advance(session, [(s.take_program, program(width=0.7))])
     assert s.to_build(session) is None and session.length == 0 and session.episode == 0
 
 
 def test_what_cannot_be_built_is_told_and_taken_back():
-    session = s.advance(opened(), [s.Slide(WEIGHT, 9.0), s.Slide(WIDTH, 7.0), s.Failed("too wide")])
+    session = s.advance(
+        opened(), [(s.slide, WEIGHT, 9.0), (s.slide, WIDTH, 7.0), (s.fail, "too wide")]
+    )
     assert session.trouble == "too wide" and s.to_build(session) is None
     assert session.numbers == {WEIGHT: 9.0, WIDTH: 0.5}
-    assert s.advance(session, [s.Slide(WEIGHT, 1.0)]).trouble == ""
+    assert s.advance(session, [(s.slide, WEIGHT, 1.0)]).trouble == ""
 
 
 def test_another_checkpoint_goes_on_with_the_episode():
-    session = s.advance(opened(), [s.Tick(0.1), s.Choose("7")])
+    session = s.advance(opened(), [(s.tick, 0.1), (s.choose, "7")])
     assert session.chosen == "7"
-    session = s.advance(session, [s.Loaded(10.0, "of update 7"), s.Step()])
+    session = s.advance(session, [(s.take_brain, 10.0, "of update 7"), (s.step,)])
     assert session.rows[-1].reward == 20.0 and session.length == 6 and session.chosen == ""
-    failed = s.advance(session, [s.Choose("8"), s.Failed("The checkpoint is damaged.")])
+    failed = s.advance(session, [(s.choose, "8"), (s.fail, "The checkpoint is damaged.")])
     assert failed.chosen == "" and failed.brain == 10.0 and "damaged" in failed.trouble
 
 
@@ -153,13 +155,13 @@ def test_slow_work_is_begun_once_and_told(monkeypatch):
         program=lambda numbers: program(width=numbers[WIDTH]), brain=broken
     )
     beside = loop.Beside()
-    session = s.advance(opened(), [s.Choose("best"), s.Slide(WIDTH, 0.75)])
+    session = s.advance(opened(), [(s.choose, "best"), (s.slide, WIDTH, 0.75)])
     loop.begin_work(session, source, beside)
     assert beside.words.startswith("reading checkpoint best")
     beside.work.result(10)
     session = s.advance(session, beside.finished())
     assert session.trouble == "OSError: the disk is away"
-    session = s.advance(session, [s.Slide(WIDTH, 0.75)])
+    session = s.advance(session, [(s.slide, WIDTH, 0.75)])
     loop.begin_work(session, source, beside)
     assert "width = 0.75" in beside.words
     loop.begin_work(session, source, beside)  # nothing more, while it is at it
@@ -172,16 +174,16 @@ def test_slow_work_is_begun_once_and_told(monkeypatch):
 
 
 def test_a_push_and_a_pull_change_the_velocity():
-    session = s.advance(opened(), [s.Push((0.0, 0.0, 1.5))])
+    session = s.advance(opened(), [(s.push, (0.0, 0.0, 1.5))])
     np.testing.assert_allclose(session.moment.env.physics.qvel, [1.5])
-    session = s.advance(opened(), [s.Pull(1, (0, 0, 0), (0, 0, 1)), s.Step()])
+    session = s.advance(opened(), [(s.pull, 1, (0, 0, 0), (0, 0, 1)), (s.step,)])
     assert session.moment.env.physics.qvel[0] > 0.5
-    held = s.advance(session, [s.Pull(1, (0, 0, 0), (0, 0, -1))])
+    held = s.advance(session, [(s.pull, 1, (0, 0, 0), (0, 0, -1))])
     np.testing.assert_allclose(held.grip.target, [0, 0, -1])
-    free = s.advance(session, [s.Release()])
+    free = s.advance(session, [(s.release,)])
     assert free.grip is None
     before = free.moment.env.physics.qvel
-    assert s.advance(free, [s.Step()]).moment.env.physics.qvel is before
+    assert s.advance(free, [(s.step,)]).moment.env.physics.qvel is before
 
 
 def test_what_is_no_event_is_refused():
@@ -193,7 +195,7 @@ def test_what_is_no_event_is_refused():
 
 
 def test_the_table_says_which_term_pays():
-    session = s.advance(opened(), [s.Tick(0.1)])
+    session = s.advance(opened(), [(s.tick, 0.1)])
     table = readouts.reward_table(session)
     assert "<td>run</td><td>4.000</td><td>4.000</td><td>20.00</td><td>+67%</td>" in table
     assert "<td>cost</td><td>-2.000</td><td>-2.000</td><td>-10.00</td><td>-33%</td>" in table
@@ -204,7 +206,7 @@ def test_the_table_says_which_term_pays():
 def test_plots_have_a_line_each_and_few_points():
     session = opened()
     for _ in range(150):
-        session = s.advance(session, [s.Tick(0.1)])
+        session = s.advance(session, [(s.tick, 0.1)])
     plot = readouts.reward_plot(session)
     assert plot.names == ("reward", "run", "cost") and len(plot.columns) == 4
     assert len(plot.columns[0]) <= readouts.MOST_POINTS
@@ -214,7 +216,7 @@ def test_plots_have_a_line_each_and_few_points():
 
 
 def test_the_state_is_told_in_lines():
-    session = s.advance(opened(3), [s.Tick(0.1)])
+    session = s.advance(opened(3), [(s.tick, 0.1)])
     lines = readouts.status_lines(session, "1.00 x real time")
     assert lines[0] == "first, seed 3, episode 1"
     assert lines[1] == "0.04 s, step 2, return 4"

@@ -18,12 +18,12 @@ from PIL import Image
 from purerl import UserError, load, run as train, view
 from purerl.core.errors import USAGE
 from purerl.tune import subject
+from purerl.tune.option_numbers import replaced
 from purerl.tune.plan import planner
 from purerl.tune.view import opening
 from purerl.tune.view.drivers import policy_driver
-from purerl.tune.view.option_numbers import replaced
 from purerl.tune.view.program import build_program, episode_key
-from purerl.tune.view.session import Push, Step, advance, open_session, take_step
+from purerl.tune.view.session import advance, open_session, push, step, take_step
 from tests.report import chromium
 from tests.tune.view import sled_experiment as sled
 
@@ -125,7 +125,7 @@ def test_the_planner_drives_an_experiment(trained):
     options = view.ViewOptions(samples=32, horizon=10, seed=1)
     session, source, title = open_with(options, Path(sled.__file__))
     assert title == "sled_experiment" and source.checkpoints() == ()
-    session = advance(session, [Push((1.0, 0.0, 0.0)), Step()])
+    session = advance(session, [(push, (1.0, 0.0, 0.0)), (step,)])
     for _ in range(40):
         session = take_step(session)
     speeds = [-row.metrics["reward_slow"] / 0.25 for row in session.rows]
