@@ -368,7 +368,7 @@ def test_look_ups_by_name():
 def step_trace(model, rewritten, readings=("xpos", "subtree_com", "cvel")):
     p = Physics(model, readings, substeps=2, engine="jax")
     p_c = Physics(model, (), substeps=2, engine="c")
-    state, _ = p_c.init(model.qpos0, np.zeros(model.nv))
+    state, _ = jax.eval_shape(p_c.init, model.qpos0, np.zeros(model.nv))
     arguments = (state, jnp.zeros(model.nu, jnp.float32), {})
     return jax.make_jaxpr(p._engine.step if rewritten else p._engine.plain_step)(*arguments)
 
