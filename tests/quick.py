@@ -5,9 +5,9 @@ from typing import Any
 
 import jax
 
-# Nothing of LLVM, and XLA's older loops, where it still has them: an update of the tests compiles in
-# 1.7 s of a core, not 6.7 (at LLVM's level 1 in 2.8). Other bits than a run's: where a test is of
-# those, it compiles as a run does.
+# Nothing of LLVM, and XLA's older loops, where it still has them: an update of the tests compiles
+# in 1.7 s of a core, not 6.7 (at LLVM's level 1 in 2.8). Other bits than a run's: where a test is
+# of those, it compiles as a run does.
 OPTIONS: dict[str, bool | int] = {"xla_backend_optimization_level": 0}
 if jax.__version_info__ < (0, 11):
     OPTIONS["xla_cpu_use_fusion_emitters"] = False
