@@ -12,6 +12,8 @@ OPTIONS: dict[str, bool | int] = {"xla_backend_optimization_level": 0}
 if jax.__version_info__ < (0, 11):
     OPTIONS["xla_cpu_use_fusion_emitters"] = False
 
+# For the XLA_FLAGS of a process.
+FLAGS = " ".join(f"--{name}={value}" for name, value in OPTIONS.items())
 JAX_JIT = jax.jit  # which the fixture `compiled_quickly` replaces
 
 
