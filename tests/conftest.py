@@ -56,7 +56,7 @@ def compiled_quickly(monkeypatch):
 
     For tests in which bits do not matter.
     """
-    monkeypatch.setattr(jax, "jit", quick.jit)
+    monkeypatch.setattr(jax, "jit", quick.Jit)
 
 
 @pytest.fixture(scope="module", autouse=True)

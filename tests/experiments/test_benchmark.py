@@ -30,7 +30,7 @@ def experiment():
 def small():
     """Its physics and update, compiled."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jax, "jit", quick.jit)
+        patch.setattr(jax, "jit", quick.Jit)
         return benchmark.make_bench(experiment(), ("physics alone", "update"))
 
 
