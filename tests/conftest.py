@@ -27,6 +27,7 @@ import pytest  # noqa: E402
 
 from purerl.core.errors import RunError  # noqa: E402
 from purerl.report.opengl import open_gl  # noqa: E402
+from tests import quick  # noqa: E402
 
 # The same examples every time: a failure belongs to the change that is tested.
 hypothesis.settings.register_profile("same", derandomize=True, deadline=None)
@@ -47,6 +48,15 @@ def opengl():
         if ctypes.util.find_library("OSMesa"):
             raise  # it needs no driver, so this is a fault of ours
         pytest.skip(str(error))
+
+
+@pytest.fixture
+def compiled_quickly(monkeypatch):
+    """What this test compiles, purerl's own programs too, is ready in a quarter of the time.
+
+    For tests in which bits do not matter.
+    """
+    monkeypatch.setattr(jax, "jit", quick.Jit)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -155,6 +155,7 @@ def test_it_is_trained_stopped_and_resumed_as_any_other(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["inverted_pendulum"])
+@pytest.mark.usefixtures("compiled_quickly")
 def test_brax_is_stepped_as_by_itself(name):
     pytest.importorskip("brax")
     env = adapters.from_brax(adapters.BraxOptions(name))
@@ -167,6 +168,7 @@ def test_brax_is_stepped_as_by_itself(name):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("compiled_quickly")
 def test_playground_is_stepped_as_by_itself():
     pytest.importorskip("mujoco_playground")
     with jax.debug_key_reuse(False):  # Playground keeps a key that it has split

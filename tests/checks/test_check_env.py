@@ -13,6 +13,8 @@ from purerl.checks import check_traces
 from purerl.checks.check_env import check_env
 from purerl.core.env import EnvError, State
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 
 @dataclasses.dataclass(frozen=True)
 class Toy:

@@ -23,7 +23,7 @@ from purerl.ppo.networks import MlpOptions, RecurrentOptions, from_linen, mlp, r
 from tests.checks.test_check_env import Toy, toy_state
 from tests.runs.toy_experiment import experiment
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("compiled_quickly")]
 
 
 def bad(findings):

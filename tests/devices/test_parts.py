@@ -1,7 +1,7 @@
 """However a minibatch is cut into parts, a gradient step is the same up to rounding."""
 
 import dataclasses
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from purerl.devices.shards import Shards, parts_of
 from purerl.devices.slices import count_slices, cut_in_slices
 from purerl.ppo import algorithm, batches, learner, running_moments
 from purerl.ppo.config import Config, Evaluation
+from tests import quick
 from tests.ppo.test_algorithm import CONFIG, ROLLOUT, UPDATE, setup
 from tests.ppo.test_running_moments import update as merge_batch
 
@@ -22,15 +23,18 @@ CUTS = {
     "shards": (2, parts_of(Shards(2))),
     "shards in slices": (4, parts_of(Shards(2), 2)),
 }
+BATCH = quick.jit(batches.make_batch, static_argnums=0)
+COLLECT = quick.jit(algorithm.collect, static_argnums=(0, 1, 2))
 
 
+@cache
 def columns(recurrent):
     """All columns of a rollout in 12 environments, [T', C], and what made them."""
     config = dataclasses.replace(CONFIG, num_envs=12)
     env, network, state = setup(config, recurrent=recurrent)
     memory = state.carry  # before the rollout
     after, transitions, _, last_value = ROLLOUT(config, env, network, state)
-    batch = batches.make_batch(config, after, transitions, last_value, state.episode.length == 0)
+    batch = BATCH(config, after, transitions, last_value, state.episode.length == 0)
     return config, network, after, batch if recurrent else batches.in_one_row(batch), memory
 
 
@@ -38,25 +42,34 @@ def cut(number, axis, tree):
     return jax.tree.map(lambda x: jnp.stack(jnp.split(x, number, axis)), tree)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CUTS)
-@pytest.mark.parametrize("recurrent", [False, True])
-def test_a_gradient_step_is_the_same_in_parts(name, recurrent):
+def gradient_step(recurrent, number, parts):
+    """Takes one step on all columns, cut into parts; returns the learner and its metrics."""
     config, network, state, batch, memory = columns(recurrent)
-    number, parts = CUTS[name]
-    begin = learner.Learner(
-        state.params, state.optimizer, state.learning_rate, state.skipped_in_a_row
-    )
 
-    def step(number, parts):
-        pieces, memories = cut(number, 1, batch), cut(number, 0, memory)
+    @quick.jit
+    def step(state, pieces, memories):
+        begin = learner.Learner(
+            state.params, state.optimizer, state.learning_rate, state.skipped_in_a_row
+        )
         size = pieces.weight.shape[2]
         order = jnp.tile(jnp.arange(size), (number, 1, 1))  # one minibatch of all columns
         scale = jax.tree.map(lambda x: x[0], learner.minibatch_moments(pieces, order, parts))
         return learner.minibatch_step(config, network, begin, pieces, memories, scale, parts)
 
-    whole, metrics = step(1, WHOLE)
-    found, others = step(number, parts)
+    return step(state, cut(number, 1, batch), cut(number, 0, memory))
+
+
+@cache
+def whole_step(recurrent):
+    return gradient_step(recurrent, 1, WHOLE)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CUTS)
+@pytest.mark.parametrize("recurrent", [False, True])
+def test_a_gradient_step_is_the_same_in_parts(name, recurrent):
+    whole, metrics = whole_step(recurrent)
+    found, others = gradient_step(recurrent, *CUTS[name])
     assert metrics["gradient_norm"] > 1e-3 and metrics.keys() == others.keys()
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5),
@@ -114,7 +127,7 @@ def test_slices_are_equal_and_not_too_small(size, changes, recurrent, platform, 
 
 def test_slices_hold_whole_environments():
     env, network, state = setup()
-    experience = algorithm.collect(CONFIG, env, network, state)[1]
+    experience = COLLECT(CONFIG, env, network, state)[1]
     sliced = cut_in_slices(3, experience)
     assert sliced.batch.weight.shape == (3, 16, 2) and sliced.env_ids.tolist() == [
         [0, 1], [2, 3], [4, 5],
@@ -128,6 +141,7 @@ def test_slices_hold_whole_environments():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("recurrent", [False, True])
+@pytest.mark.usefixtures("compiled_quickly")
 def test_on_a_gpu_an_update_is_two_programs_that_make_the_same(recurrent, monkeypatch):
     env, network, state = setup(recurrent=recurrent)
     expected, metrics = UPDATE(CONFIG, env, network, state)
@@ -150,8 +164,8 @@ def test_on_a_gpu_minibatches_are_cut_in_slices(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(shards, "count_slices", lambda *x: asked.append(x) or 2)
     env, network, state = setup()
-    after, experience = algorithm.collect(CONFIG, env, network, state)
-    improve = partial(shards.improve, CONFIG, network, Shards())
+    after, experience = COLLECT(CONFIG, env, network, state)
+    improve = quick.jit(partial(shards.improve, CONFIG, network, Shards()))
     _, metrics = improve(after, experience)
     assert asked == [(CONFIG, 6, False, "gpu")]
     assert metrics["skipped_minibatches"] == 0 and metrics["gradient_norm"] > 0

@@ -60,6 +60,7 @@ def trajectory(name, engine, height=0.0):
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["c", "jax"])
 @pytest.mark.parametrize("name", BUILDERS)
+@pytest.mark.usefixtures("compiled_quickly")
 def test_contract(name, engine):
     check_env(build(name, engine), num_envs=NUMBER)
 

@@ -204,6 +204,7 @@ def ks_distance(a, b):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("compiled_quickly")
 def test_environments_keep_the_protocol(pair):
     check_env(pair[0], num_envs=2, num_steps=3)
 

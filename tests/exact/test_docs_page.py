@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests import quick
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -18,7 +20,7 @@ def blocks(kind):
 @pytest.mark.slow
 def test_the_pages_code_prints_what_the_page_says():
     program = "\n".join(blocks("python"))
-    environment = os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": ""}
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": quick.FLAGS}
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, env=environment, cwd=ROOT
     )

@@ -148,8 +148,8 @@ def test_kernels_give_way_to_what_they_replace_when_differentiated():
     ours = exact.rewrite(kernels, platform=GPU)
     assert len(named(jax.make_jaxpr(ours)(*args), "pallas_call")) == 4
     for derivative in (jax.grad, jax.jacfwd):
-        found = jax.jit(derivative(ours, (0, 1)))(*args)
-        assert_close(found, derivative(kernels, (0, 1))(*args), 1e-4)
+        found = quick.jit(derivative(ours, (0, 1)))(*args)
+        assert_close(found, quick.jit(derivative(kernels, (0, 1)))(*args), 1e-4)
 
 
 # Two links, the second held by its limit: Newton's method makes several iterations.

@@ -14,6 +14,7 @@ import pytest
 from purerl.core.errors import UserError
 from purerl.experiment.loading import find
 from purerl.experiments.benchmarks import benchmark, scaling, start_up
+from tests import quick
 
 
 def experiment():
@@ -28,10 +29,13 @@ def experiment():
 @pytest.fixture(scope="module")
 def small():
     """Its physics and update, compiled."""
-    return benchmark.make_bench(experiment(), ("physics alone", "update"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax, "jit", quick.Jit)
+        return benchmark.make_bench(experiment(), ("physics alone", "update"))
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("compiled_quickly")
 def test_every_part_is_run():
     bench = benchmark.make_bench(experiment())
     assert tuple(part.name for part in bench.parts) == benchmark.PARTS

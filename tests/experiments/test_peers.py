@@ -32,7 +32,7 @@ def starting_at(state, data):
 def steps():
     """Single steps from states on Gymnasium's way: (its observation, reward, terminated), ours."""
     theirs, env = gymnasium.make("Ant-v5").unwrapped, gymnasium_ant.build(engine="c")
-    step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.key(0))
+    step, state = quick.jit(env.step), quick.jit(env.reset)(jax.random.key(0))
     actions = np.random.default_rng(0).uniform(-1, 1, (STEPS, env.action_size))
     theirs.reset(seed=0)
     found = []
@@ -82,7 +82,7 @@ def test_starts_are_spread_as_gymnasiums():
     expected = np.array([theirs.reset()[0] for _ in range(2000)])
     env = gymnasium_ant.build(engine="c")
     keys = jax.random.split(jax.random.key(0), 2000)
-    starts = np.asarray(jax.jit(jax.vmap(env.reset))(keys).observation)
+    starts = np.asarray(quick.jit(jax.vmap(env.reset))(keys).observation)
     np.testing.assert_allclose(starts.mean(0), expected.mean(0), atol=0.02)
     np.testing.assert_allclose(starts.std(0), expected.std(0), atol=0.01)
     np.testing.assert_allclose(starts.max(0)[:13], expected.max(0)[:13], atol=0.01)

@@ -58,6 +58,7 @@ def arrange(given: str, place: Path, trained: Path, monkeypatch) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("compiled_quickly")
 @pytest.mark.parametrize("mistake", TABLE, ids=[f"{m.where}-{m.title}" for m in TABLE])
 def test_a_mistake_is_one_line(place, trained, monkeypatch, request, mistake):
     if mistake.says.endswith("`physics` of the type purerl.Physics."):

@@ -116,7 +116,7 @@ def test_states_are_those_of_the_policy(trained):
     found = restore(trained, "latest", print)
     config = dataclasses.replace(found.setup.config, episode_length=7)
     setup, state, key = found.setup._replace(config=config), found.saved.state, jax.random.key(5)
-    recording = jax.jit(lambda s: episode_pictures.record(setup, s, key, 2, 9))(state)
+    recording = quick.jit(lambda s: episode_pictures.record(setup, s, key, 2, 9))(state)
     assert recording.shown.shape == (10, 2)  # the start, and 9 steps
     assert recording.shown.sum(0).tolist() == [8, 8] and recording.over.all()
     assert recording.length.tolist() == [7, 7]
@@ -163,7 +163,7 @@ class Stretched:
 def test_each_episode_keeps_the_geometry_it_had(trained):
     found = restore(trained, "latest", print)
     setup = found.setup._replace(env=Stretched(found.setup.env))
-    recording = jax.jit(lambda s: episode_pictures.record(setup, s, jax.random.key(0), 3, 4))(
+    recording = quick.jit(lambda s: episode_pictures.record(setup, s, jax.random.key(0), 3, 4))(
         found.saved.state
     )
     widths = np.asarray(recording.pictures.changes["geom_size"])[:, :, 1, 0]

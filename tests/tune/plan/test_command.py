@@ -23,6 +23,8 @@ from tests.tune.plan.toys import Point
 ROOT = Path(__file__).parent.parent.parent.parent
 SMALL = ["--samples", "8", "--horizon", "10", "--knots", "3", "--steps", "20"]
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 
 def test_a_table_of_two_groups_compares_episode_by_episode():
     a = {"episode_return": np.arange(6.0), "only": np.ones(6)}

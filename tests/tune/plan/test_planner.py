@@ -9,6 +9,7 @@ import pytest
 
 from purerl.tune.plan import planner
 from purerl.tune.plan.settings import Settings
+from tests import quick
 from tests.tune.plan.toys import Ending, Point
 
 NAMES = ("predictive_sampling", "mppi", "cem")
@@ -134,7 +135,7 @@ def test_a_lost_simulation_is_worth_nothing_at_all():
 
 @functools.cache
 def program(settings, env, guide):
-    return jax.jit(functools.partial(planner.plan, settings, env, guide))
+    return quick.jit(functools.partial(planner.plan, settings, env, guide))
 
 
 def choose(settings, env, guide, place, steps=1, seed=0):
