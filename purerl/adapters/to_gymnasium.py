@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 from purerl.adapters.stepping import Drawer, check_length, example, sound_step, to_numpy
 from purerl.core.env import Env, State
 from purerl.core.records import Array
-from purerl.ppo.rollout import select
+from purerl.ppo.episodes import select
 
 
 def spaces(env: Env) -> tuple[gymnasium.Space, gymnasium.Space]:
