@@ -147,10 +147,10 @@ def our_parts(chosen: Experiment) -> list[Part]:
     key = jax.random.key(chosen.seed)
     abstract = abstract_state(config, env, network).env.physics
     bare: Callable = partial(physics_alone, env, config.rollout_length)
-    compiling = compilation.start("physics alone", jax.jit(bare).trace(abstract, key), {})
+    compiling = compilation.start("physics alone", jax.jit(bare).trace(abstract, key))
     never = Evaluation(number=0)
     programs = compile_programs(config, env, network, never, True, Shards())
-    alone, state = compiling.result(), programs.init(key)
+    (alone, _), state = compiling.result(), programs.init(key)
     # A copy: an update takes its state over.
     start = jax.tree.map(jnp.copy, state.env.physics)
     trainer = Ours(programs.update, state)

@@ -36,7 +36,8 @@ def as_it_is(state: Any) -> Any:
 class Compiling(NamedTuple):
     """An update that is being compiled, and how a state gets to it and back."""
 
-    finish: Callable[[], Callable[[Any], tuple[Any, Metrics]]]  # waits for it, and returns it
+    # Waits for it; returns it, and how many seconds each of its programs took.
+    finish: Callable[[], tuple[Callable[[Any], tuple[Any, Metrics]], dict[str, float]]]
     unordered: list[str]  # its sums without a fixed order
     judged: PyTree  # shapes of what an evaluation is given
     spread: Callable[[Any], Any] = as_it_is  # onto several devices
@@ -122,14 +123,12 @@ def portable(function: Callable) -> Callable:
     return traced
 
 
-def start(name: str, traced: Any, seconds: dict[str, float]) -> Future[Any]:
-    """Compiles a traced program in a thread of its own, and notes how many seconds it took."""
+def start(name: str, traced: Any) -> Future[tuple[Any, float]]:
+    """Compiles a traced program in a thread of its own; the future has it, and the seconds."""
     begin, lowered = time.perf_counter(), traced.lower()
 
-    def compile_it() -> Any:
-        compiled = lowered.compile()
-        seconds[name] = time.perf_counter() - begin
-        return compiled
+    def compile_it() -> tuple[Any, float]:
+        return lowered.compile(), time.perf_counter() - begin
 
     pool = ThreadPoolExecutor(1, f"purerl-compile-{name}")
     future = pool.submit(compile_it)
@@ -137,14 +136,12 @@ def start(name: str, traced: Any, seconds: dict[str, float]) -> Future[Any]:
     return future
 
 
-def when_needed(
-    name: str, function: Any, example: PyTree, seconds: dict[str, float]
-) -> Callable[..., Any]:
+def when_needed(name: str, function: Any, example: PyTree) -> Callable[..., Any]:
     """Returns a jitted function, compiled beside the others, or on few cores when it is called."""
     if len(os.sched_getaffinity(0)) <= FEW_CORES:
         return function
-    program = start(name, function.trace(example), seconds)
-    return lambda *arguments: program.result()(*arguments)
+    program = start(name, function.trace(example))
+    return lambda *arguments: program.result()[0](*arguments)
 
 
 def unordered(traced: Any) -> list[str]:

@@ -185,12 +185,8 @@ def compile_update(
     env: Env,
     network: Network,
     abstract: TrainState,
-    seconds: dict[str, float],
 ) -> Compiling:
-    """Compiles an update of several shards, from the `abstract` shapes of the whole state.
-
-    How long that takes is noted in `seconds`.
-    """
+    """Compiles an update of several shards, from the `abstract` shapes of the whole state."""
     begin, layout = time.perf_counter(), make_layout(shards, config.num_envs)
     mesh = layout.mesh
     learned = abstract.replace(**dict.fromkeys(PLACES))
@@ -208,13 +204,13 @@ def compile_update(
     traced = improving.trace(
         shapes(learned, NamedSharding(mesh, SAME)), shapes(whole, NamedSharding(mesh, SPLIT))
     )
-    started = start("update", traced, seconds)
+    started = start("update", traced)
 
-    def finish() -> Callable[[Spread], tuple[Spread, Metrics]]:
-        compiled = started.result()
-        seconds["update"] = time.perf_counter() - begin
+    def finish() -> tuple[Callable[[Spread], tuple[Spread, Metrics]], dict[str, float]]:
+        compiled, _ = started.result()
+        seconds = {"update": time.perf_counter() - begin}
         workers = ThreadPoolExecutor(len(collects))
-        return functools.partial(update, layout, collects, compiled, workers)
+        return functools.partial(update, layout, collects, compiled, workers), seconds
 
     return Compiling(
         finish=finish,

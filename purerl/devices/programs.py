@@ -79,7 +79,7 @@ def compile_programs(
     # Initialisation is a program too: computed operation by operation, it has other bits.
     init: Any = functools.partial(algorithm.init, config, env, network)
     judge: Any = functools.partial(evaluate_in_run, config, env, network, evaluation.num_episodes)
-    key, seconds = jax.random.key(0), dict[str, float]()
+    key = jax.random.key(0)
     if vmapped_seeds > 1:
         init, judge = jax.vmap(init), jax.vmap(judge)
         key = jax.random.split(key, vmapped_seeds)
@@ -87,20 +87,22 @@ def compile_programs(
         abstract = jax.eval_shape(init, key)
         task = (config, env, network, abstract)
         if shards.number > 1:
-            compiling = multi_device.compile_update(shards, *task, seconds)
+            compiling = multi_device.compile_update(shards, *task)
         else:
             in_halves = calls_host or jax.default_backend() == "gpu"
-            compiling = compile_update(*task, vmapped_seeds > 1, in_halves, seconds)
+            compiling = compile_update(*task, vmapped_seeds > 1, in_halves)
         begin, evaluate = jit("init", init), jit("evaluation", judge)
-        beginning = start("init", begin.trace(key), seconds) if fresh else None
+        beginning = start("init", begin.trace(key)) if fresh else None
         if evaluation.number:
-            evaluate = when_needed("evaluation", evaluate, compiling.judged, seconds)
-        update = compiling.finish()
+            evaluate = when_needed("evaluation", evaluate, compiling.judged)
+        update, seconds = compiling.finish()
+        if beginning:
+            begin, seconds["init"] = beginning.result()
     return Programs(
-        init=beginning.result() if beginning else begin,
+        init=begin,
         update=update,
         evaluate=lambda state: evaluate(compiling.to_judge(state)),
-        seconds=dict(seconds),  # the evaluation's may come later
+        seconds=seconds,
         unordered=compiling.unordered,
         spread=compiling.spread,
         fetch=compiling.fetch,
@@ -122,12 +124,10 @@ def compile_update(
     abstract: TrainState,
     vmapped: bool,
     in_halves: bool,
-    seconds: dict[str, float],
 ) -> Compiling:
     """Compiles an update on one device, as one program or `in_halves`: acting, then learning.
 
-    The `abstract` shapes of the state are [S, ...] if `vmapped`. What each program takes is noted
-    in `seconds`.
+    The `abstract` shapes of the state are [S, ...] if `vmapped`.
     """
     whole: list[tuple[str, Callable]] = [
         ("update", functools.partial(algorithm.update, config, env, network))
@@ -140,12 +140,14 @@ def compile_update(
     for name, function in halves if in_halves else whole:
         function = jax.vmap(function) if vmapped else function
         traced.append(jit(name, function, donate_argnums=0).trace(*given))
-        started.append(start(name, traced[-1], seconds))
+        started.append((name, start(name, traced[-1])))
         given = shapes(traced[-1].out_info)
 
-    def finish() -> Callable[[Any], tuple[Any, Metrics]]:
-        programs = [program.result() for program in started]
-        return functools.partial(update, *programs) if in_halves else programs[0]
+    def finish() -> tuple[Callable[[Any], tuple[Any, Metrics]], dict[str, float]]:
+        done = {name: program.result() for name, program in started}
+        programs = [program for program, _ in done.values()]
+        seconds = {name: took for name, (_, took) in done.items()}
+        return functools.partial(update, *programs) if in_halves else programs[0], seconds
 
     sums = sorted({place for part in traced for place in unordered(part)})
     return Compiling(finish, sums, judged=abstract)

@@ -106,10 +106,10 @@ def build_program(
             (lambda v, b, m: move(built(v), driver, b, m), (values, brain, first)),
         ]
         compiled = [
-            compile_beside("init", jit("init", function).trace(*given), {})
+            compile_beside("init", jit("init", function).trace(*given))
             for function, given in programs
         ]
-        start, step = (program.result() for program in compiled)
+        start, step = (program.result()[0] for program in compiled)
     except (UserError, RunError):
         raise
     except Exception as error:  # of the environment's code: any
