@@ -7,14 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from purerl.checks.check_env import (
-    Trial,
-    check_differs,
-    check_keys_repeat,
-    check_shapes,
-    check_steps_repeat,
-    try_out,
-)
+from purerl.checks import check_env
 from purerl.checks.check_traces import check_traces
 from purerl.checks.findings import Finding, error, ok, some, warning
 from purerl.checks.user_code import in_words, own_line
@@ -32,7 +25,7 @@ def examine(env: Env, num_steps: int = NUM_STEPS) -> Iterator[Finding]:
     """Yields what is found of an environment, the cheapest first; stops where it cannot go on."""
     before = _members(env)
     try:
-        check_shapes(env)
+        check_env.check_shapes(env)
     except EnvError as broken:
         yield error("protocol", one_line(broken))
         return
@@ -42,7 +35,7 @@ def examine(env: Env, num_steps: int = NUM_STEPS) -> Iterator[Finding]:
         what = f"reset or step sets env.{changed[0]}, and a compiled program does so only once"
         yield error("own state", f"{what}: what an episode must remember goes into State.task.")
     try:
-        trial = try_out(env, max(NUM_ENVS, env.action_size + 1), num_steps)
+        trial = check_env.try_out(env, max(NUM_ENVS, env.action_size + 1), num_steps)
     except Exception as failed:
         yield error("steps", f"it cannot be stepped: {in_words(failed)}{own_line(failed)}")
         return
@@ -52,14 +45,18 @@ def examine(env: Env, num_steps: int = NUM_STEPS) -> Iterator[Finding]:
     yield from check_placed(env)
 
 
-def check_repeats(env: Env, trial: Trial) -> Finding:
+def check_repeats(env: Env, trial: check_env.Trial) -> Finding:
     """Tells whether the environment does the same twice: in one program, and in two."""
-    checks = ((check_traces, env), (check_keys_repeat, trial), (check_steps_repeat, trial))
+    checks = (
+        (check_traces, env),
+        (check_env.check_keys_repeat, trial),
+        (check_env.check_steps_repeat, trial),
+    )
     twice = [_told("same twice", "reset and step", error, *check) for check in checks]
     return next((one for one in twice if one.level != "ok"), twice[0])
 
 
-def check_trial(trial: Trial) -> Iterator[Finding]:
+def check_trial(trial: check_env.Trial) -> Iterator[Finding]:
     """Yields what is found in what environments did."""
     yield check_keys(trial.start)
     broken = not_finite(trial)
@@ -109,10 +106,10 @@ def _told(about: str, good: str, bad: Callable, check: Callable, *arguments: Any
 
 def check_keys(start: State) -> Finding:
     """Warns of a reset that ignores its key."""
-    return _told("keys", "other keys, other starts", warning, check_differs, start)
+    return _told("keys", "other keys, other starts", warning, check_env.check_differs, start)
 
 
-def not_finite(trial: Trial) -> Finding:
+def not_finite(trial: check_env.Trial) -> Finding:
     """Names all that is NaN, infinite or absurd: reward terms, metrics, observation entries."""
     found = []
     for name, (start, later) in _leaves(trial).items():
@@ -142,13 +139,13 @@ def _when(values: np.ndarray, wrong: np.ndarray, actions: Any) -> str:
     return f"{values[first]:.3g} for the first time at step {step} of {number}, by [{action}]"
 
 
-def _leaves(trial: Trial) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _leaves(trial: check_env.Trial) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Returns path -> floats [B, ...] at the start and [T, B, ...] after each step."""
     start, later = flatten(trial.start), flatten(trial.states)
     return {n: (x, later[n]) for n, x in start.items() if np.issubdtype(x.dtype, np.floating)}
 
 
-def check_ends(trial: Trial) -> Iterator[Finding]:
+def check_ends(trial: check_env.Trial) -> Iterator[Finding]:
     """Finds episodes that end before they begin, or that all last one step."""
     ended = np.asarray(trial.start.terminated | trial.start.truncated)
     first = np.asarray((trial.states.terminated | trial.states.truncated)[0])
@@ -165,7 +162,7 @@ def check_ends(trial: Trial) -> Iterator[Finding]:
         yield ok("ends", "no episode begins ended")
 
 
-def check_reward(trial: Trial) -> Finding:
+def check_reward(trial: check_env.Trial) -> Finding:
     """Warns of a reward that never changes."""
     reward = np.asarray(trial.states.reward)
     if np.ptp(reward) == 0:
@@ -174,7 +171,7 @@ def check_reward(trial: Trial) -> Finding:
     return ok("reward", f"{reward.min():.3g} to {reward.max():.3g} by random actions")
 
 
-def check_scale(trial: Trial) -> Iterator[Finding]:
+def check_scale(trial: check_env.Trial) -> Iterator[Finding]:
     """Warns of observation entries that are constant, hardly vary, or are huge."""
     number = 0
     for name, (start, later) in _leaves(trial).items():
@@ -206,7 +203,7 @@ def _cure(what: str) -> str:
     return "choose another unit"
 
 
-def check_actions(trial: Trial) -> Finding:
+def check_actions(trial: check_env.Trial) -> Finding:
     """Warns of entries of the action that change nothing.
 
     Environments that start alike are given the same actions, but for one entry in each, which has

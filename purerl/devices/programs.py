@@ -15,17 +15,7 @@ import jax
 from purerl.core.env import Env
 from purerl.core.keys import Purpose, derive
 from purerl.core.records import Array, Metrics, Network, PyTree, TrainState
-from purerl.devices import multi_device
-from purerl.devices.compilation import (
-    Compiling,
-    as_it_is,
-    jit,
-    no_collection,
-    shapes,
-    start,
-    unordered,
-    when_needed,
-)
+from purerl.devices import compilation, multi_device
 from purerl.devices.shards import Shards, improve
 from purerl.ppo import algorithm
 from purerl.ppo.config import Config, Evaluation
@@ -43,8 +33,8 @@ class Programs(NamedTuple):
     evaluate: Callable[[Any], Metrics]
     seconds: dict[str, float]  # that each took to compile, side by side; without the evaluation
     unordered: list[str]  # sums of the update whose order nothing fixes on a GPU
-    spread: Callable[[TrainState], Any] = as_it_is  # onto the devices, for the others
-    fetch: Callable[[Any], TrainState] = as_it_is  # back onto one
+    spread: Callable[[TrainState], Any] = compilation.as_it_is  # onto the devices, for the others
+    fetch: Callable[[Any], TrainState] = compilation.as_it_is  # back onto one
 
 
 def abstract_state(config: Config, env: Env, network: Network) -> PyTree:
@@ -83,7 +73,7 @@ def compile_programs(
     if vmapped_seeds > 1:
         init, judge = jax.vmap(init), jax.vmap(judge)
         key = jax.random.split(key, vmapped_seeds)
-    with no_collection():
+    with compilation.no_collection():
         abstract = jax.eval_shape(init, key)
         task = (config, env, network, abstract)
         if shards.number > 1:
@@ -91,10 +81,10 @@ def compile_programs(
         else:
             in_halves = calls_host or jax.default_backend() == "gpu"
             compiling = compile_update(*task, vmapped_seeds > 1, in_halves)
-        begin, evaluate = jit("init", init), jit("evaluation", judge)
-        beginning = start("init", begin.trace(key)) if fresh else None
+        begin, evaluate = compilation.jit("init", init), compilation.jit("evaluation", judge)
+        beginning = compilation.start("init", begin.trace(key)) if fresh else None
         if evaluation.number:
-            evaluate = when_needed("evaluation", evaluate, compiling.judged)
+            evaluate = compilation.when_needed("evaluation", evaluate, compiling.judged)
         update, seconds = compiling.finish()
         if beginning:
             begin, seconds["init"] = beginning.result()
@@ -124,7 +114,7 @@ def compile_update(
     abstract: TrainState,
     vmapped: bool,
     in_halves: bool,
-) -> Compiling:
+) -> compilation.Compiling:
     """Compiles an update on one device, as one program or `in_halves`: acting, then learning.
 
     The `abstract` shapes of the state are [S, ...] if `vmapped`.
@@ -139,9 +129,9 @@ def compile_update(
     given, traced, started = (abstract,), [], []
     for name, function in halves if in_halves else whole:
         function = jax.vmap(function) if vmapped else function
-        traced.append(jit(name, function, donate_argnums=0).trace(*given))
-        started.append((name, start(name, traced[-1])))
-        given = shapes(traced[-1].out_info)
+        traced.append(compilation.jit(name, function, donate_argnums=0).trace(*given))
+        started.append((name, compilation.start(name, traced[-1])))
+        given = compilation.shapes(traced[-1].out_info)
 
     def finish() -> tuple[Callable[[Any], tuple[Any, Metrics]], dict[str, float]]:
         done = {name: program.result() for name, program in started}
@@ -149,8 +139,8 @@ def compile_update(
         seconds = {name: took for name, (_, took) in done.items()}
         return functools.partial(update, *programs) if in_halves else programs[0], seconds
 
-    sums = sorted({place for part in traced for place in unordered(part)})
-    return Compiling(finish, sums, judged=abstract)
+    sums = sorted({place for part in traced for place in compilation.unordered(part)})
+    return compilation.Compiling(finish, sums, judged=abstract)
 
 
 def update(

@@ -11,20 +11,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from purerl.report import comparison, page_tables
+from purerl.report import comparison, page_series, page_tables
 from purerl.report.html_elements import Html, element, join
 from purerl.report.page_charts import SMALL, WIDE, chart, look, short
 from purerl.report.page_media import LARGEST_PAGE, Media, media_elements, read_media, size
-from purerl.report.page_series import (
-    MOST_PANELS,
-    RETURN,
-    SECTIONS,
-    Panel,
-    Series,
-    constant,
-    metric_names,
-    panels,
-)
 from purerl.report.run_reader import RunRecord
 from purerl.report.seed_statistics import Group, make_groups
 
@@ -42,8 +32,8 @@ def make_page(runs: Sequence[RunRecord], group_by: Sequence[str] = ()) -> str:
       UserError: there is no such setting.
     """
     groups = make_groups(runs, group_by)
-    result, _ = comparison.compare_records(runs, RETURN, group_by)
-    sections = panels(groups)
+    result, _ = comparison.compare_records(runs, page_series.RETURN, group_by)
+    sections = page_series.panels(groups)
     experiments = list(dict.fromkeys(run.settings["experiment"] for run in runs))
     title = f"{', '.join(experiments)}: {len(runs)} run{'s' * (len(runs) > 1)}"
     body = [
@@ -122,14 +112,14 @@ def _box(name: str, label: str, style: str, key: str, of: str | None = None) -> 
     return element("label", box, element("span", class_=f"swatch {style}"), label)
 
 
-def _charts(sections: Sequence[tuple[str, list[Panel]]], several: bool) -> list[Html]:
+def _charts(sections: Sequence[tuple[str, list[page_series.Panel]]], several: bool) -> list[Html]:
     """Returns the charts under their headings; a metric that never changes is a line of text."""
     parts, number = [], 0
     for title, inside in sections:
-        wide = title == SECTIONS[0][0]
+        wide = title == page_series.SECTIONS[0][0]
         drawn, still = [], []
         for panel in inside:
-            value = constant(panel)
+            value = page_series.constant(panel)
             if value is None:
                 drawn.append(chart(panel, number, WIDE if wide else SMALL, several))
             else:
@@ -147,8 +137,8 @@ def _charts(sections: Sequence[tuple[str, list[Panel]]], several: bool) -> list[
 
 def _unseen(runs: Sequence[RunRecord]) -> list[Html]:
     """Returns a line about metrics that have no chart; empty where all have."""
-    more = len(metric_names(runs)) - MOST_PANELS
-    said = f"{more:,} more metrics have no chart: a page takes {MOST_PANELS}."
+    more = len(page_series.metric_names(runs)) - page_series.MOST_PANELS
+    said = f"{more:,} more metrics have no chart: a page takes {page_series.MOST_PANELS}."
     return [element("p", said, class_="note")] if more > 0 else []
 
 
@@ -159,7 +149,7 @@ BANDS = (
 )
 
 
-def _data(sections: Sequence[tuple[str, list[Panel]]], groups: Sequence[Group]) -> Html:
+def _data(sections: Sequence[tuple[str, list[page_series.Panel]]], groups: Sequence[Group]) -> Html:
     """Returns what stands under the pointer, as JSON in which no element can end."""
     several = len(groups) > 1
     found = [
@@ -171,7 +161,9 @@ def _data(sections: Sequence[tuple[str, list[Panel]]], groups: Sequence[Group]) 
     return element("script", Html(text), type="application/json", id="data")
 
 
-def _series_data(series: Series, groups: Sequence[Group], several: bool) -> dict[str, Any]:
+def _series_data(
+    series: page_series.Series, groups: Sequence[Group], several: bool
+) -> dict[str, Any]:
     def rounded(values: list[float] | None) -> list[float] | None:
         return values and [float(f"{v:.6g}") for v in values]
 

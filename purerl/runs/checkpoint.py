@@ -23,14 +23,6 @@ from purerl.machine import array_files
 from purerl.machine.files import hash_files, sync, sync_tree
 from purerl.machine.state_arrays import Leaves, digest_leaves, leaf_paths, raw, unflatten
 from purerl.runs import checkpoint_folder
-from purerl.runs.checkpoint_folder import (
-    META,
-    WRITING,
-    DamagedError,
-    check_files,
-    load_meta,
-    path_of,
-)
 from purerl.runs.identity import Owner, check_owner
 
 
@@ -52,8 +44,8 @@ def save(folder: Path, leaves: Leaves, meta: dict[str, Any]) -> Path:
     Raises:
       OSError or ValueError when the disk refuses; nothing partial is left behind.
     """
-    path = path_of(folder, meta["update"])
-    draft = path.with_name(WRITING + path.name)
+    path = checkpoint_folder.path_of(folder, meta["update"])
+    draft = path.with_name(checkpoint_folder.WRITING + path.name)
     stored = {key: array for key, array in leaves.items() if array.size}  # Orbax refuses empty ones
     try:
         shutil.rmtree(draft, ignore_errors=True)
@@ -64,7 +56,7 @@ def save(folder: Path, leaves: Leaves, meta: dict[str, Any]) -> Path:
         _compare(array_files.read(draft / "state", stored), meta["leaves"])
         meta["files"] = hash_files(draft)
         meta["meta_sha256"] = checkpoint_folder.hash_meta(meta)
-        (draft / META).write_text(json.dumps(meta))
+        (draft / checkpoint_folder.META).write_text(json.dumps(meta))
         sync_tree(draft)
         checkpoint_folder.discard(path)
         draft.rename(path)
@@ -88,10 +80,10 @@ def load_checkpoint(path: Path, abstract: PyTree, owners: Sequence[Owner] = ()) 
       UserError: it cannot be read, or it is whole, but another run's, or of another state than
         `abstract` (other sizes or networks).
     """
-    meta = load_meta(path)
+    meta = checkpoint_folder.load_meta(path)
     check_owner(path, meta, owners)
     wanted = _check_fits(path, meta, abstract)
-    check_files(path, meta)
+    checkpoint_folder.check_files(path, meta)
     leaves = {key: np.zeros(shape, jnp.dtype(dtype)) for key, (dtype, shape) in wanted.items()}
     try:
         leaves |= array_files.read(path / "state", {k: x for k, x in leaves.items() if x.size})
@@ -131,10 +123,10 @@ def newest(
     for update in reversed(checkpoint_folder.common_updates(folders)):
         found = []
         for folder, of in zip(folders, owners or [()] * len(folders), strict=True):
-            path = path_of(folder, update)
+            path = checkpoint_folder.path_of(folder, update)
             try:
                 found.append(load_checkpoint(path, abstract, of))
-            except DamagedError as error:
+            except checkpoint_folder.DamagedError as error:
                 kept = checkpoint_folder.set_aside(path) if rename else path
                 say(f"Checkpoint of update {update} is damaged: {error}. It is kept as {kept}; "
                     "the one before it is taken, if there is one.")  # fmt: skip
@@ -152,9 +144,9 @@ def check_fits(folder: Path, updates: Sequence[int], abstract: PyTree) -> None:
       abstract: shapes of the state.
     """
     for update in reversed(updates):
-        path = path_of(folder, update)
-        with contextlib.suppress(DamagedError):
-            _check_fits(path, load_meta(path), abstract)
+        path = checkpoint_folder.path_of(folder, update)
+        with contextlib.suppress(checkpoint_folder.DamagedError):
+            _check_fits(path, checkpoint_folder.load_meta(path), abstract)
             return
 
 

@@ -10,15 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import UserError
-from purerl.machine.files import (
-    check_object,
-    make_folder,
-    read_bytes,
-    read_json,
-    reason,
-    write_file,
-    write_json,
-)
+from purerl.machine import files
 from purerl.machine.lock import LOCK
 from purerl.runs import checkpoint_folder
 from purerl.runs.identity import fingerprint
@@ -82,8 +74,8 @@ def read(path: Path) -> Folder:
     listed = _list(path)
     if not listed.is_run:
         return listed
-    config, manifest = read_json(path / CONFIG), read_json(path / MANIFEST)
-    return listed._replace(config=config, manifest=manifest, code=read_bytes(path / CODE))
+    config, manifest = files.read_json(path / CONFIG), files.read_json(path / MANIFEST)
+    return listed._replace(config=config, manifest=manifest, code=files.read_bytes(path / CODE))
 
 
 def _list(path: Path) -> Folder:
@@ -98,27 +90,27 @@ def _list(path: Path) -> Folder:
         names = frozenset(entry.name for entry in entries)
         return Folder(path, path.exists(), names, frozenset(links), {}, {}, b"", updates, damaged)
     except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read: {reason(error)}.") from error
+        raise UserError(f"{path} cannot be read: {files.reason(error)}.") from error
 
 
 def read_run(path: Path) -> Folder:
     """Reads the folder of a run; UserError, with the runs inside of it, if it holds none."""
     check_is_run(path)
     folder = read(path)
-    check_object(str(path / CONFIG), folder.config, experiment=str, settings=dict)
+    files.check_object(str(path / CONFIG), folder.config, experiment=str, settings=dict)
     return folder
 
 
 def check_manifest(folder: Folder) -> dict[str, Any]:
     """Returns manifest.json; UserError unless it has what is needed to use the run."""
     where = str(folder.path / MANIFEST)
-    facts = check_object(
+    facts = files.check_object(
         where, folder.manifest, run_id=str, name=str, fingerprint=str, experiment_file=str,
         engine=str, source=dict, num_shards=int, model=str | None,
     )  # fmt: skip
     for change in allowed_changes(folder):
-        check_object(f"{where}: allowed_changes", change, fingerprint=str, after_update=int)
-        check_object(f"{where}: allowed_changes", change.get("of", {}))
+        files.check_object(f"{where}: allowed_changes", change, fingerprint=str, after_update=int)
+        files.check_object(f"{where}: allowed_changes", change.get("of", {}))
     return facts
 
 
@@ -126,16 +118,16 @@ def allowed_changes(folder: Folder) -> list[dict[str, Any]]:
     """Returns what --allow-changes has let pass, in order."""
     where = str(folder.path / MANIFEST)
     known = {"allowed_changes": [], **folder.manifest}
-    return check_object(where, known, allowed_changes=list)["allowed_changes"]
+    return files.check_object(where, known, allowed_changes=list)["allowed_changes"]
 
 
 def write(folder: Folder, config: dict[str, Any], manifest: dict[str, Any], code: bytes) -> Folder:
     """Writes the three files that describe a run; config.json last, it makes it a run."""
     manifest = manifest | {"fingerprint": fingerprint(config, manifest, code)}
-    make_folder(folder.checkpoints)
-    write_file(folder.path / CODE, code)
-    write_json(folder.path / MANIFEST, manifest)
-    write_json(folder.path / CONFIG, config)
+    files.make_folder(folder.checkpoints)
+    files.write_file(folder.path / CODE, code)
+    files.write_json(folder.path / MANIFEST, manifest)
+    files.write_json(folder.path / CONFIG, config)
     names = folder.names | {CONFIG, MANIFEST, CODE, CHECKPOINTS}
     return folder._replace(names=names, config=config, manifest=manifest, code=code)
 
@@ -145,7 +137,7 @@ def note(folder: Folder, **facts: Any) -> Folder:
     if all(folder.manifest.get(name) == value for name, value in facts.items()):
         return folder
     manifest = folder.manifest | facts
-    write_json(folder.path / MANIFEST, manifest)
+    files.write_json(folder.path / MANIFEST, manifest)
     return folder._replace(manifest=manifest)
 
 
@@ -167,4 +159,4 @@ def runs_in(place: Path) -> list[Path]:
         below = (sorted(place.glob(f"{stars}/{CONFIG}")) for stars in ("*", "*/*"))
         return [file.parent for file in next(filter(None, below), [])]
     except (OSError, ValueError) as error:
-        raise UserError(f"{place} cannot be read: {reason(error)}.") from error
+        raise UserError(f"{place} cannot be read: {files.reason(error)}.") from error

@@ -7,7 +7,7 @@ may differ. With one program, logging, evaluation and checkpoints cannot change 
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -21,8 +21,9 @@ from purerl.machine import state_arrays
 from purerl.runs import checkpoint_folder
 from purerl.runs.metrics_file import MAX_SKIPPED_IN_A_ROW, Record
 from purerl.training.plan import Plan
-from purerl.training.summary import summarize
 from purerl.training.writer import RunWriter
+
+COUNTS = ("episodes", "nonfinite_resets", "replayed_resets", "skipped_minibatches")
 
 
 def train(
@@ -111,6 +112,29 @@ def _make_records(
         | {f"train/{name}": value for name, value in summarize(metrics).items()}
         for count, metrics in zip(steps, windows, strict=True)
     ]
+
+
+def summarize(window: Sequence[Mapping[str, Any]]) -> Record:
+    """Joins the metrics of several updates: counts are summed, the rest is averaged.
+
+    Metrics of episodes that ended (`episode...`) are averaged over the episodes, not over the
+    updates. They are None if no episode ended.
+    """
+    counts = [float(metrics["episodes"]) for metrics in window]
+    record: Record = {}
+    for name in window[0]:
+        values = [float(metrics[name]) for metrics in window]
+        if name in COUNTS:
+            record[name] = sum(values)
+        elif name == "skipped_in_a_row":
+            record[name] = values[-1]
+        elif name.startswith("episode"):
+            # An update without an ended episode has nothing to say: not 0, and not NaN.
+            weighted = sum(v * n for v, n in zip(values, counts, strict=True) if n)
+            record[name] = weighted / sum(counts) if sum(counts) else None
+        else:
+            record[name] = sum(values) / len(values)
+    return record
 
 
 def _summarize_evaluation(metrics: Metrics) -> Record:

@@ -29,14 +29,8 @@ from purerl.machine.files import disk_errors
 from purerl.machine.lock import FolderLock
 from purerl.ppo.config import Config
 from purerl.ppo.learner import is_recurrent
-from purerl.runs import checkpoint, folder as run_folder, manifest
+from purerl.runs import checkpoint, folder as run_folder, manifest, resume
 from purerl.runs.folder import Folder, check_manifest
-from purerl.runs.resume import (
-    Description,
-    check_new_or_resume,
-    describe_config,
-    what_to_write,
-)
 from purerl.training import console
 from purerl.training.loggers import check_loggers
 from purerl.training.plan import make_plan
@@ -62,7 +56,7 @@ def execute(
     with processes.fail_together(), ExitStack() as stack:
         processes.start(options.distributed)
         experiments = list(runs.values())
-        in_first_process(lambda: check_new_or_resume(found, experiments, options.resume))
+        in_first_process(lambda: resume.check_new_or_resume(found, experiments, options.resume))
         check_loggers(options)
         cache = compilation.set_up_jax(options.cache)
         job = prepare(source, experiments[0], found, options, stop)
@@ -153,7 +147,7 @@ def begin(
             locks.append(FolderLock(path))
             stack.callback(locks[-1].close)
         folders = [run_folder.read(path) for path in runs]  # another process may have been here
-        check_new_or_resume(folders, list(runs.values()), job.options.resume)
+        resume.check_new_or_resume(folders, list(runs.values()), job.options.resume)
         begun = any(folder.is_begun for folder in folders)
         written = [
             _write_down(source, folder, one, job, begun)
@@ -175,8 +169,8 @@ def _write_down(
 ) -> Folder:
     """Writes what a run is, unless that is there already; returns what its folder holds then."""
     schedule = {"log_every": job.plan.log_every, "checkpoints": job.options.checkpoints}
-    now = Description(describe_config(source, chosen, schedule), job.facts, source)
-    facts = what_to_write(folder, now, job.options.allow_changes, begun)
+    now = resume.Description(resume.describe_config(source, chosen, schedule), job.facts, source)
+    facts = resume.what_to_write(folder, now, job.options.allow_changes, begun)
     if facts is None:
         return folder
     checkpoint.check_fits(folder.checkpoints, folder.updates, job.abstract)

@@ -10,7 +10,7 @@ import pytest
 from purerl.core.errors import UserError
 from purerl.runs.metrics_file import MetricsFile
 from purerl.training.loggers import BackgroundLogger, _TensorBoardSink
-from purerl.training.summary import summarize
+from purerl.training.loop import summarize
 
 
 def test_counts_are_summed_and_episodes_weigh_by_their_number():
