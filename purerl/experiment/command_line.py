@@ -108,36 +108,26 @@ def from_command_line(
     Raises:
       UserError: there is no such option, or a value is wrong.
     """
-    chosen, options = _parse_over(source.experiment, source, arguments, prog, config, base, names)
-    if getattr(options, "debug", False):  # tiny sizes, but for those that were given
-        tiny = shrunk(source.experiment)
-        return _parse_over(tiny, source, arguments, prog, config, base, names)
-    return chosen, options
 
+    def over(experiment: Experiment) -> tuple[Experiment, Any]:
+        values = settings_json.settings_of(experiment)
+        values = {name: values[name] for name in names or values}
+        kinds = {f.name: f.type for f in dataclasses.fields(Experiment)}
+        kinds |= {name: type(v) for name, v in values.items() if dataclasses.is_dataclass(v)}
+        # A class made for this experiment: its settings have the types of their values, which is
+        # all that the command line needs to know: an environment's options need no registration.
+        fields = [(name, kinds[name], dataclasses.field(kw_only=True)) for name in values]
+        both = dataclasses.make_dataclass("Settings", fields, bases=(base,), frozen=True)
+        both.__doc__ = summary(source.path) or f"Trains {source.name}."
+        parsed = parse(both, arguments, prog, both(**values), config)
+        overrides = {name: getattr(parsed, name) for name in values}
+        options = {f.name: getattr(parsed, f.name) for f in dataclasses.fields(base)}
+        return dataclasses.replace(experiment, **overrides), base(**options)
 
-def _parse_over(
-    experiment: Experiment,
-    source: Source,
-    arguments: Sequence[str],
-    prog: str,
-    config: Any,
-    base: Any,
-    names: Sequence[str],
-) -> tuple[Experiment, Any]:
-    """Parses a command line over the settings of an experiment; see `from_command_line`."""
-    values = settings_json.settings_of(experiment)
-    values = {name: values[name] for name in names or values}
-    kinds = {f.name: f.type for f in dataclasses.fields(Experiment)}
-    kinds |= {name: type(v) for name, v in values.items() if dataclasses.is_dataclass(v)}
-    # A class made for this experiment: its settings have the types of their values, which is all
-    # that the command line needs to know, so an environment's options need no registration.
-    fields = [(name, kinds[name], dataclasses.field(kw_only=True)) for name in values]
-    both = dataclasses.make_dataclass("Settings", fields, bases=(base,), frozen=True)
-    both.__doc__ = summary(source.path) or f"Trains {source.name}."
-    parsed = parse(both, arguments, prog, both(**values), config)
-    overrides = {name: getattr(parsed, name) for name in values}
-    options = {f.name: getattr(parsed, f.name) for f in dataclasses.fields(base)}
-    return dataclasses.replace(experiment, **overrides), base(**options)
+    chosen, options = over(source.experiment)
+    # Tiny sizes, but for those that were given.
+    debug = getattr(options, "debug", False)
+    return over(shrunk(source.experiment)) if debug else (chosen, options)
 
 
 def from_settings(

@@ -70,6 +70,11 @@ def evaluate_policy(
     # Ends with the last episode, so no episode is cut off. A mean over those that end within a
     # fixed number of steps would favour short ones.
     end = jax.lax.while_loop(lambda p: ~p.over.all(), step, progress)
+    return results(end)
+
+
+def results(end: Progress) -> Metrics:
+    """Returns the figures of N episodes that are over, name -> [N], as `evaluate_policy`."""
     return episodes.episode_metrics(end.episode) | {
         "episode_return": end.episode.episode_return,
         "episode_length": end.episode.length.astype(jnp.float32),

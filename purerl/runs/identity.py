@@ -41,12 +41,6 @@ def owners(facts: dict[str, Any]) -> list[Owner]:
     return found
 
 
-def signature(facts: dict[str, Any], config: dict[str, Any]) -> dict[str, Any]:
-    """Returns what a checkpoint says of whose it is."""
-    seed = config["settings"]["seed"]
-    return {"run_id": facts["run_id"], "seed": seed, "fingerprint": facts["fingerprint"]}
-
-
 def check_owner(path: Path, meta: dict[str, Any], owners: Sequence[Owner]) -> None:
     """Raises UserError if a checkpoint is of none of `owners` (no owners: of anybody)."""
     run: dict[str, Any] = meta["run"] if isinstance(meta.get("run"), dict) else {}

@@ -34,12 +34,10 @@ from purerl.machine.command_errors import tell
 from purerl.machine.files import disk_errors
 from purerl.machine.lock import FolderLock
 from purerl.machine.output import Say
-from purerl.runs import checkpoint, checkpoint_folder, folder as run_folder, identity, manifest
-from purerl.runs.folder import Folder, check_manifest
+from purerl.runs import checkpoint, checkpoint_folder, identity, manifest
+from purerl.runs.folder import CHECKPOINTS, Folder, check_manifest, note
 from purerl.runs.metrics_file import MetricsFile, Record, keep_whole_lines
-from purerl.runs.resume import (
-    with_change,
-)
+from purerl.runs.resume import with_change
 from purerl.training import console, loop
 from purerl.training.loggers import open_loggers
 from purerl.training.plan import Plan
@@ -72,7 +70,7 @@ class Seed(NamedTuple):
     @property
     def checkpoints(self) -> Path:
         """The folder of its checkpoints."""
-        return self.path / run_folder.CHECKPOINTS
+        return self.path / CHECKPOINTS
 
 
 def train_all(job: Job, seeds: list[Seed]) -> None:
@@ -134,7 +132,8 @@ def _train_together(job: Job, seeds: list[Seed], programs: Callable[[], Programs
         writers: list[Any] = [processes.Silent(seed.checkpoints) for seed in seeds]
         if processes.is_first():
             with disk_errors():
-                seeds = [_note_exactness(seed, job, compiled) for seed in seeds]
+                exactness = manifest.with_unordered(job.facts, _unordered(compiled))
+                seeds = [s._replace(folder=note(s.folder, **exactness)) for s in seeds if s.folder]
                 writers = _open_writers(seeds, saved, job, say)
             for writer in writers:
                 stack.callback(writer.close)
@@ -186,13 +185,6 @@ def _first_state(
     return processes.state_of_first(state, job.abstract)
 
 
-def _note_exactness(seed: Seed, job: Job, programs: Programs) -> Seed:
-    """Notes in manifest.json what is known only when programs are compiled."""
-    assert seed.folder
-    exactness = manifest.with_unordered(job.facts, _unordered(programs))
-    return seed._replace(folder=run_folder.note(seed.folder, **exactness))
-
-
 def _open_writers(
     seeds: list[Seed], saved: list[checkpoint.Saved], job: Job, say: Say
 ) -> list[RunWriter]:
@@ -224,5 +216,5 @@ def _open_metrics(
     place = keep_whole_lines(folder.metrics, meta["update"])
     entry = {"after_update": meta["update"], "changes": [change]}
     entry["fingerprint"] = folder.manifest["fingerprint"]
-    folder = run_folder.note(folder, **with_change(folder.manifest, entry))
+    folder = note(folder, **with_change(folder.manifest, entry))
     return folder, MetricsFile(folder.metrics, *place)

@@ -16,7 +16,6 @@ from purerl.machine.output import Say
 from purerl.machine.state_arrays import Leaves, digest_leaves
 from purerl.runs import checkpoint, checkpoint_folder
 from purerl.runs.folder import Folder, note
-from purerl.runs.identity import signature
 from purerl.runs.metrics_file import MetricsFile, Record
 from purerl.training.loggers import BackgroundLogger
 
@@ -53,7 +52,8 @@ class RunWriter:
         make_folder(self.checkpoints)
         checkpoint_folder.clean(self.checkpoints)
         self.lock, self.metrics = lock, metrics
-        self.signature = signature(folder.manifest, folder.config)
+        self.signature = {name: folder.manifest[name] for name in ("run_id", "fingerprint")}
+        self.signature["seed"] = folder.config["settings"]["seed"]
         self.keep, self.say, self.worker, self.together = keep, say, worker, together
         self.loggers: list[BackgroundLogger] = []
         self.last: Future[None] | None = None

@@ -15,7 +15,6 @@ from purerl.core.records import Array
 from purerl.devices.compilation import jit
 from purerl.ppo import evaluation
 from purerl.ppo.config import Config
-from purerl.ppo.episodes import episode_metrics
 from purerl.ppo.evaluation import Progress
 from purerl.tune.plan import planner
 from purerl.tune.plan.planner import Guide, Plan
@@ -136,10 +135,5 @@ def episodes(
 
 def results(playing: Playing) -> dict[str, np.ndarray]:
     """Returns figures of episodes that are over, name -> [E], as `evaluation.evaluate_policy`."""
-    progress = playing.progress
-    found = episode_metrics(progress.episode) | {
-        "episode_return": progress.episode.episode_return,
-        "episode_length": progress.episode.length.astype(jnp.float32),
-        "lost": progress.lost.astype(jnp.float32),
-    }
+    found = evaluation.results(playing.progress)
     return {name: np.asarray(x, float) for name, x in found.items()}
