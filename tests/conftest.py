@@ -35,8 +35,10 @@ hypothesis.settings.load_profile("same")
 
 jax.config.update("jax_debug_key_reuse", True)  # a key consumed twice raises
 
-# Files that take a minute or more, the longest first: begun last, one would run alone at the end.
-LONGEST = ("shards", "run", "interface", "seeds", "algorithm", "suite", "probes", "kill", "envs")
+# Files that take most, the longest first (274 to 45 s of a core, nothing compiled, 28 November
+# 2026): begun last, one would run alone at the end.
+LONGEST = ("shards", "run", "suite", "interface", "golden", "algorithm", "probes", "kill", "seeds")
+LONGEST += ("parts", "threads")
 
 
 @pytest.fixture(scope="session")
