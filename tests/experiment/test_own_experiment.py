@@ -9,6 +9,8 @@ from purerl import evaluate, run
 from purerl.core import errors
 from purerl.runs import restored_run
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 ROOT = Path(__file__).parent.parent.parent
 MINE = """
 import dataclasses
