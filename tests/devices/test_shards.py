@@ -90,7 +90,7 @@ def test_a_run_is_the_same_on_as_many_devices_as_shards(toy, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["c", pytest.param("jax", marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("engine", ["c", "jax"])
 def test_physics_is_the_same_on_any_number_of_devices(tmp_path, engine):
     words = [*CARTPOLE, "--engine", engine, "--num-shards", "4"]
     for devices in (1, 2):
