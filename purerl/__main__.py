@@ -5,6 +5,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from purerl import __version__
 from purerl.core.errors import USAGE, UserError, unknown_name
 from purerl.experiment.loading import summary
 from purerl.machine.command_errors import leave, tell
@@ -28,6 +29,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     name, *rest = (sys.argv[1:] if arguments is None else list(arguments)) or [""]
     if name in COMMANDS:
         return importlib.import_module(f"purerl.{module_of(name)}").main(rest)
+    if name == "--version":
+        return show(__version__) or 0
     if name not in ("", "-h", "--help"):
         return tell(UserError(unknown_name("command", name, COMMANDS)))
     for command in COMMANDS:

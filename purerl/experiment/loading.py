@@ -94,7 +94,8 @@ def find_source(name: str) -> Source:
     if spec is not None and str(spec.origin).endswith(".py"):
         return load_file(Path(str(spec.origin)))
     if Path(name).exists() or Path(f"{name}.py").is_file():
-        raise UserError(f"{name} is no Python file; an experiment is one, as {Path(name).stem}.py.")
+        like = f"{name}/experiment" if Path(name).is_dir() else Path(name).stem
+        raise UserError(f"{name} is no Python file; an experiment is one, as {like}.py.")
     places = f" in {' or '.join(map(str, _folders()))}"
     raise UserError(unknown_name("experiment", name, named, places))
 

@@ -87,6 +87,8 @@ class RunOptions:
         """Checks the rules."""
         least = {"num_seeds": 1, "num_shards": 0, "log_every": 0, "checkpoints": 0, "keep": 1}
         check_least(self, ValueError, **least)
+        if self.debug and self.resume:
+            raise ValueError("A debug run is made anew: leave out --resume, or --debug.")
 
     @property
     def vmapped_seeds(self) -> int:

@@ -53,7 +53,7 @@ def known_places(text: bytes, name: str) -> list[Path]:
     """Returns the files whose code is known to be `text`; of named experiments, that of `name`."""
     named = loading.available().get(name)
     found = [named] if named is not None and named.read_bytes() == text else []
-    wanted = _hash(text)
+    wanted = hashlib.sha256(text).hexdigest()
     for line in _lines():
         with contextlib.suppress(ValueError, TypeError):
             known, place = line.split(None, 1)
@@ -63,7 +63,7 @@ def known_places(text: bytes, name: str) -> list[Path]:
 
 def remember(text: bytes, place: Path) -> None:
     """Adds an experiment to the list; a home that cannot be written to is no mistake of a run."""
-    line = f"{_hash(text)}  {json.dumps(str(place))}"
+    line = f"{hashlib.sha256(text).hexdigest()}  {json.dumps(str(place))}"
     if line in _lines():
         return
     with contextlib.suppress(OSError, RuntimeError):
@@ -85,7 +85,3 @@ def _list() -> Path:
     if not states.is_absolute():  # the freedesktop.org specification takes no other
         states = Path.home() / ".local" / "state"
     return states / "purerl" / "trusted"
-
-
-def _hash(text: bytes) -> str:
-    return hashlib.sha256(text).hexdigest()

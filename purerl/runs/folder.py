@@ -143,9 +143,9 @@ def note(folder: Folder, **facts: Any) -> Folder:
 
 def check_is_run(path: Path) -> None:
     """Raises UserError unless a folder holds a run; the message lists the runs inside of it."""
-    found = runs_in(path)
+    found = runs_in(path) or runs_in("runs" / path)
     if found != [path]:
-        runs = f" Runs in it: {', '.join(map(str, found))}." if found else ""
+        runs = f" Runs found: {', '.join(map(str, found))}." if found else ""
         what = f"no run: it has no {CONFIG}" if path.is_dir() else "no folder"
         raise UserError(f"{path} is {what}.{runs}")
 

@@ -50,15 +50,14 @@ def check_new_or_resume(
 def _check_usable(folder: Folder, chosen: Experiment, resume: bool) -> None:
     """Raises UserError if one folder may not be written."""
     for name in sorted(folder.links):
-        what = f"{folder.path / name} is no file of the run, but a link or worse"
-        raise UserError(f"{what}: remove it.")
+        path = folder.path / name
+        raise UserError(f"{path} is no file of the run, but a link or worse: remove it.")
     if folder.is_begun and not resume:
         raise UserError(f"The run {folder.path} exists{_how_to_begin(folder, chosen)}")
     # Drafts are of a run that was killed while it started.
     strange = folder.names - OURS - {draft_of(Path(name)).name for name in OURS}
     if strange and not folder.is_run:
-        what = f"{folder.path} is no run (it holds {min(strange)})"
-        raise UserError(f"{what}; use another --name.")
+        raise UserError(f"{folder.path} is no run (it holds {min(strange)}); use another --name.")
     # config.json is written before all that a run learns.
     if not folder.is_run and (folder.updates or folder.damaged):
         raise UserError(

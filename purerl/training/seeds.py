@@ -67,11 +67,6 @@ class Seed(NamedTuple):
     folder: Folder | None = None
     lock: FolderLock | None = None
 
-    @property
-    def checkpoints(self) -> Path:
-        """The folder of its checkpoints."""
-        return self.path / CHECKPOINTS
-
 
 def train_all(job: Job, seeds: list[Seed]) -> None:
     """Trains vmapped seeds together, and others one after another; RunError if one failed."""
@@ -129,7 +124,7 @@ def _train_together(job: Job, seeds: list[Seed], programs: Callable[[], Programs
             say(f"Resuming after update {one.meta['update']}. Digest {one.meta['digest']}")
         state = _first_state(known["found"], saved, seeds, job, compiled)
         tell_first(None if known["found"] else state.env, say)
-        writers: list[Any] = [processes.Silent(seed.checkpoints) for seed in seeds]
+        writers: list[Any] = [processes.Silent(seed.path / CHECKPOINTS) for seed in seeds]
         if processes.is_first():
             with disk_errors():
                 exactness = manifest.with_unordered(job.facts, _unordered(compiled))
@@ -190,7 +185,7 @@ def _open_writers(
 ) -> list[RunWriter]:
     """Opens what writes each seed's folder, cut back to the checkpoints `saved`."""
     worker = ThreadPoolExecutor(1, "purerl-writer")
-    together = [seed.checkpoints for seed in seeds]
+    together = [seed.path / CHECKPOINTS for seed in seeds]
     metas = [one.meta for one in saved] or [NO_CHECKPOINT] * len(seeds)
     opened = []
     for seed, meta in zip(seeds, metas, strict=True):

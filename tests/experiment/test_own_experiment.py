@@ -242,7 +242,7 @@ def test_a_folder_of_runs_lists_them(place, capsys):
     place_of_run = place / "runs" / "mine" / "seed1"
     assert restored_run.restore(str(place_of_run), "latest", print).saved.meta["update"] == 4
     for folder, message in [
-        (place_of_run.parent, f"Runs in it: {place_of_run}."),
+        (place_of_run.parent, f"Runs found: {place_of_run}."),
         (place_of_run.parent / "sed1", "sed1 is no folder"),
     ]:
         assert evaluate.main([str(folder)]) == errors.USAGE

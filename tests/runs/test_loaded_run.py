@@ -159,7 +159,7 @@ def test_metrics_start_no_jax(run):
 def test_a_folder_without_a_run_is_one_line(run, tmp_path):
     with pytest.raises(purerl.UserError, match="is no run: it has no config.json.$"):
         purerl.load(tmp_path)
-    with pytest.raises(purerl.UserError, match="Runs in it: "):
+    with pytest.raises(purerl.UserError, match="Runs found: "):
         purerl.load(run.folder.parent)
 
 
