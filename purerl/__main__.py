@@ -30,7 +30,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name in COMMANDS:
         return importlib.import_module(f"purerl.{module_of(name)}").main(rest)
     if name == "--version":
-        return show(__version__) or 0
+        show(__version__)
+        return 0
     if name not in ("", "-h", "--help"):
         return tell(UserError(unknown_name("command", name, COMMANDS)))
     for command in COMMANDS:

@@ -100,6 +100,11 @@ def test_the_commands_are_listed_a_line_each_and_called(capsys, tmp_path):
     assert re.search("Did you mean .?evaluate.?\\?", capsys.readouterr().err)
 
 
+def test_the_version_is_printed(capsys):
+    assert commands.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"{purerl.__version__}\n"
+
+
 def test_the_console_script_is_the_list_of_commands():
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     assert scripts == {"purerl": "purerl.__main__:console"} and callable(commands.console)

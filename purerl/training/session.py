@@ -160,8 +160,8 @@ def begin(
         each = zip(runs.items(), written, locks, strict=True)
         return [Seed(path, one.seed, folder, lock) for (path, one), folder, lock in each]
 
-    others = [Seed(path, one.seed) for path, one in runs.items()]
-    return kept_by_first(locked) or others
+    # What folders hold is the first process's to know.
+    return kept_by_first(locked) or [Seed(path, one.seed) for path, one in runs.items()]
 
 
 def _write_down(

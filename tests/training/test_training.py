@@ -119,6 +119,8 @@ def test_debug_makes_an_experiment_tiny_and_leaves_no_run_here(tmp_path, monkeyp
     assert few.folder.name == "seed3" and not list(tmp_path.iterdir())
     again = purerl.train(str(TOY), {"ppo.num_envs": 4}, debug=True, seed=3)
     assert again.folder != few.folder and again.digest == few.digest
+    with pytest.raises(purerl.UserError, match="A debug run is made anew: leave out --resume"):
+        purerl.train(str(TOY), debug=True, resume=True)
     kept = purerl.train(str(TOY), debug=True, runs=tmp_path / "mine")
     assert kept.folder.is_relative_to(tmp_path / "mine")
 
