@@ -117,9 +117,9 @@ def busy_after(threads: Iterable[threading.Thread], seconds: float = 3.0) -> str
 
 def keep_programs() -> None:
     """Lets commands with the same settings share the compiled programs."""
-    from purerl.training import session
+    from purerl.training import seeds
 
-    compile_programs, made = session.compile_programs, dict[str, Any]()
+    compile_programs, made = seeds.compile_programs, dict[str, Any]()
 
     def kept(
         config: Any,
@@ -135,7 +135,7 @@ def keep_programs() -> None:
             made[key] = compile_programs(config, env, network, evaluation, True, *rest, **options)
         return made[key]
 
-    session.compile_programs = kept
+    seeds.compile_programs = kept
 
 
 if __name__ == "__main__":

@@ -14,8 +14,7 @@ import pytest
 import purerl
 from purerl import compare, evaluate, run
 from purerl.core.errors import FAILURE, SUCCESS, USAGE
-from purerl.machine import files
-from purerl.runs import checkpoint_folder
+from purerl.runs import checkpoint_folder, metrics_file
 
 pytestmark = pytest.mark.slow
 
@@ -264,7 +263,7 @@ def plug(path: Path) -> None:
 
 def large(path: Path) -> None:
     with path.open("wb") as file:
-        file.truncate(files.LARGEST_METRICS + 1)
+        file.truncate(metrics_file.LARGEST + 1)
 
 
 def zeros(path: Path) -> None:

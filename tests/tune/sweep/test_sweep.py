@@ -322,6 +322,7 @@ def test_a_task_whose_time_is_over_saves_and_goes_on(place):
 @pytest.mark.slow
 def test_a_sweep_that_was_killed_ends_as_one_left_in_peace(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))  # where the toy finds its probes
     words = [str(TOY), "--grid", "ppo.learning-rate=1e-2,1e-3", "--seeds", "2"]
     words += ["--ppo.num-steps", "4800", "--checkpoints", "15"]
     assert sweep.main([*words, "--name", "peace", "--jobs", "2"]) == SUCCESS
