@@ -79,8 +79,9 @@ def update(config: Config, env: Env, network: Network, state: State) -> State:
     seen = state.observations  # stands still until the end, so that the first ratio is 1
     state, rows, last_value = rollout(config, env, network, state)
 
-    # Advantages, from the last step to the first.
-    reward = rows.reward * (config.reward_scale * jax.lax.rsqrt(state.returns.variance[0] + 1e-8))
+    # Advantages, from the last step to the first. The statistics of returns have this rollout.
+    returns = merge(state.returns, rows.discounted)
+    reward = rows.reward * (config.reward_scale * jax.lax.rsqrt(returns.variance[0] + 1e-8))
     following = jnp.concatenate([rows.value[1:], last_value[None]])
     following = jnp.where(rows.truncated, rows.truncation_value, following)
     delta = reward + config.gamma * jnp.where(rows.terminated, 0.0, following) - rows.value
@@ -113,7 +114,6 @@ def update(config: Config, env: Env, network: Network, state: State) -> State:
     learner = state.params, state.optimizer
     (params, optimizer), _ = jax.lax.scan(epoch, learner, jnp.arange(config.num_epochs))
     state = state._replace(params=params, optimizer=optimizer, update=state.update + 1)
-    returns = merge(state.returns, rows.discounted)
     return state._replace(observations=merge(seen, rows.observation), returns=returns)
 
 
@@ -122,7 +122,7 @@ def rollout(config: Config, env: Env, network: Network, state: State) -> tuple[S
     ids = jnp.arange(config.num_envs, dtype=jnp.int32)
     # What replaces the environments whose episodes end in this rollout.
     keys = per_environment(derive(state.key, Purpose.RESET, state.update), ids)
-    fresh = jax.vmap(lambda key: env.reset(jax.random.fold_in(key, 0)))(keys)
+    fresh = jax.vmap(env.reset)(keys)
 
     def ask(env_state: Any) -> Any:
         observation = normalize(state.observations, env_state.observation)

@@ -30,8 +30,7 @@ import jax
 import jax.numpy as jnp
 
 from purerl import exact
-from purerl.core.parts import WHOLE
-from purerl.core.records import Array, Network, PyTree, TrainState
+from purerl.core.records import Array, PyTree, TrainState
 from purerl.experiment import command_line, objects
 from purerl.experiment.definition import Experiment
 from purerl.experiment.loading import find_source
@@ -39,7 +38,7 @@ from purerl.experiments.benchmarks import start_up
 from purerl.experiments.benchmarks.output import count, output_file
 from purerl.machine.command_errors import leave
 from purerl.physics.lookup import scale_action
-from purerl.ppo import algorithm, learner
+from purerl.ppo import algorithm
 from purerl.ppo.evaluation import evaluate_policy
 from purerl.ppo.rollout import rollout
 from purerl.training.console import size
@@ -83,18 +82,18 @@ def bare_physics(env: Any, config: algorithm.Config, state: TrainState, key: Arr
         action = jax.random.uniform(jax.random.fold_in(key, t), size, minval=-1.0, maxval=1.0)
         ctrl = jax.vmap(partial(scale_action, env.physics.model))(action)
         changes: Callable = getattr(env, "model_changes", lambda _: {})
-        changed = jax.vmap(changes)(state.env)
+        changed = jax.vmap(changes)(state.env_state)
         following, _ = jax.vmap(env.physics.step)(physics, ctrl, changed)
         # One that blows up starts again, so that all are worth their time.
         lost = ~jnp.isfinite(following.qpos).all(axis=1)
         following = jax.tree.map(
             lambda a, b: jnp.where(jnp.expand_dims(lost, tuple(range(1, a.ndim))), b, a),
             following,
-            state.env.physics,
+            state.env_state.physics,
         )
         return following, None
 
-    return jax.lax.scan(step, state.env.physics, jnp.arange(config.rollout_length))[0]
+    return jax.lax.scan(step, state.env_state.physics, jnp.arange(config.rollout_length))[0]
 
 
 def make_bench(experiment: Experiment, names: Sequence[str] = PARTS) -> Bench:
@@ -109,7 +108,7 @@ def make_bench(experiment: Experiment, names: Sequence[str] = PARTS) -> Bench:
     programs: list[tuple[str, Callable, tuple, int | None]] = [
         ("physics alone", partial(bare_physics, env, config), (state, key), steps),
         ("rollout", partial(rollout, config, env, network), (state,), steps),
-        ("learner", partial(learn, config, network), (state, seen), steps),
+        ("learner", partial(algorithm.improve, config, network), (state, seen), steps),
         ("update", partial(algorithm.update, config, env, network), (state,), steps),
         (
             "evaluation",
@@ -128,14 +127,6 @@ def make_bench(experiment: Experiment, names: Sequence[str] = PARTS) -> Bench:
         programs = programs[1:]
     parts = [compile_part(*program) for program in programs if program[0] in names]
     return Bench(parts, state, config.num_envs)
-
-
-def learn(
-    config: algorithm.Config, network: Network, state: TrainState, seen: algorithm.Experience
-) -> tuple[TrainState, PyTree]:
-    """The learner alone, on one rollout's experience."""
-    part_ids = seen.env_ids[:, 0]
-    return learner.learn(config, network, state, seen.batch, seen.memory, part_ids, WHOLE)
 
 
 def compile_part(name: str, function: Callable, arguments: tuple, steps: int | None) -> Part:

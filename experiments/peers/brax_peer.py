@@ -152,7 +152,7 @@ def our_parts(chosen: Experiment) -> list[Part]:
     programs = compile_programs(config, env, network, never, True, Shards())
     (alone, _), state = compiling.result(), programs.init(key)
     # A copy: an update takes its state over.
-    start = jax.tree.map(jnp.copy, state.env.physics)
+    start = jax.tree.map(jnp.copy, state.env_state.physics)
     trainer = Ours(programs.update, state)
     trainer()
     return [

@@ -19,8 +19,8 @@ Shapes, everywhere in this project, time first (`[T, B, ...]`):
 `[]` is a scalar, `[...]` any leading batch axes. A docstring that says `[O]` describes one
 environment, unbatched; the caller's `vmap` makes it `[B, O]`.
 
-What a recurrent network keeps from one step to the next is its memory. The field of `TrainState` is
-called `carry`, and its environments' states `env`: field names are part of a checkpoint's digest.
+What a recurrent network keeps from one step to the next is its memory. Names of `TrainState`'s
+fields are part of a checkpoint's digest.
 """
 
 from collections.abc import Callable
@@ -115,11 +115,10 @@ class TrainState(struct.PyTreeNode):
     learning_rate: Array  # [] float32; moves only under the adaptive-KL schedule
     normalizer: PyTree  # running_moments.Statistics of the observation
     reward_normalizer: PyTree  # running_moments.Statistics of the discounted return, [] each
-    # Where the environments are. A digest hashes the names of fields, so it is at the next change
-    # of bits that `number`, `env` and `carry` become `env_ids`, `env_state` and `memory`.
-    number: Array  # [B] int32 each environment's id, which its random keys are folded with
-    env: PyTree  # core.env.State, [B, ...]
-    carry: PyTree  # the policy's memory, [B, H]; () for a feed-forward network
+    # Where the environments are.
+    env_ids: Array  # [B] int32 which its random keys are folded with
+    env_state: PyTree  # core.env.State, [B, ...]
+    memory: PyTree  # the policy's, [B, H]; () for a feed-forward network
     episode: EpisodeStats  # [B]
     discounted_return: Array  # [B] running return, for reward scaling
     # Bookkeeping.

@@ -36,11 +36,11 @@ def of_machine() -> int:
 def least(config: Config, abstract: PyTree, action_size: int) -> dict[str, int]:
     """Returns what a run's parts take at least [bytes], of one seed on one device."""
     number = config.num_envs
-    sample = size(abstract.env.observation) / number + 4 * (action_size + SCALARS)
+    sample = size(abstract.env_state.observation) / number + 4 * (action_size + SCALARS)
     # An update has the rollouts as they were collected, and shuffled for the minibatches.
     rollouts = 2 * math.ceil(sample * config.steps_per_update)
     learned = size((abstract.params, abstract.optimizer))
-    parts = {"environments": size((abstract.env, abstract.episode)), "rollouts": rollouts}
+    parts = {"environments": size((abstract.env_state, abstract.episode)), "rollouts": rollouts}
     return parts | {"the network and its optimizer": learned}
 
 

@@ -28,7 +28,7 @@ from purerl.ppo.algorithm import Experience
 from purerl.ppo.config import Config
 
 # Fields of TrainState that are [B, ...].
-PLACES = ("number", "env", "carry", "episode", "discounted_return")
+PLACES = ("env_ids", "env_state", "memory", "episode", "discounted_return")
 SAME = PartitionSpec()  # a copy on every device
 SPLIT = PartitionSpec(AXIS)
 
@@ -216,11 +216,11 @@ def compile_update(
         finish=finish,
         unordered=sorted({*sums, *unordered(traced)}),
         judged=shapes(
-            learned.replace(carry=abstract.carry), SingleDeviceSharding(layout.here[0][0])
+            learned.replace(memory=abstract.memory), SingleDeviceSharding(layout.here[0][0])
         ),
         spread=functools.partial(spread, layout),
         fetch=functools.partial(fetch, layout),
-        to_judge=functools.partial(one_copy, layout, abstract.carry),
+        to_judge=functools.partial(one_copy, layout, abstract.memory),
     )
 
 
@@ -248,7 +248,7 @@ def compile_collects(
     return compiled, traced.out_info[1], unordered(traced)
 
 
-def one_copy(layout: Layout, carry: PyTree, state: Spread) -> TrainState:
-    """Returns what an evaluation needs of a state, on one device; `carry`: the memory's shapes."""
-    zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), carry)
-    return on(layout.here[0][0], state.learned).replace(carry=zeros)
+def one_copy(layout: Layout, memory: PyTree, state: Spread) -> TrainState:
+    """Returns what an evaluation needs of a state, on one device; `memory`: its shapes."""
+    zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), memory)
+    return on(layout.here[0][0], state.learned).replace(memory=zeros)

@@ -47,7 +47,7 @@ def cut_in_slices(number: int, experience: Experience) -> Experience:
     if number == 1:
         return experience
     return experience._replace(
-        batch=cut(2, experience.batch),
+        transitions=cut(2, experience.transitions),
         memory=cut(1, experience.memory),
         env_ids=cut(1, experience.env_ids),
     )

@@ -76,7 +76,7 @@ def check_memory(setup: Setup, abstract: PyTree) -> Finding:
 
 def check_minibatch(setup: Setup, abstract: PyTree) -> Finding:
     """Warns of minibatches so small that their gradients are noise."""
-    config, recurrent = setup.config, is_recurrent(abstract.carry)
+    config, recurrent = setup.config, is_recurrent(abstract.memory)
     samples = config.steps_per_update // config.num_minibatches
     what = f"{config.num_minibatches} in an update, of {samples:,} steps each"
     if samples < FEW_SAMPLES:

@@ -63,7 +63,7 @@ def build(chosen: Experiment) -> Setup:
     with users_errors(""), naming_broken_rules(env):
         # Sizes that do not fit together show here, in a second.
         abstract = abstract_state(*setup[:3])
-        check_minibatches(setup.config, is_recurrent(abstract.carry), setup.config.num_envs)
+        check_minibatches(setup.config, is_recurrent(abstract.memory), setup.config.num_envs)
     return setup
 
 

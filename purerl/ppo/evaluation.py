@@ -97,7 +97,7 @@ def start(
     fresh = jax.vmap(env.reset)(per_environment(reset_key, jnp.arange(num_episodes)))
     limit = jnp.full(num_episodes, episode_length, jnp.int32)
     never = jnp.zeros(num_episodes, bool)
-    memory = episodes.start_memory(state.carry, num_episodes)
+    memory = episodes.start_memory(state.memory, num_episodes)
     episode, t = episodes.start_episodes(fresh, limit), jnp.zeros((), jnp.int32)
     return Progress(t, fresh, memory, episode, over=never, lost=never)
 

@@ -62,7 +62,7 @@ def learn(
     """
     if not is_recurrent(memory):
         batch = jax.vmap(in_one_row)(batch)
-    num_columns = batch.weight.shape[-1]
+    num_columns = batch.valid.shape[-1]
     rate = scheduled_rate(config, state)
     learner = Learner(state.params, state.optimizer, rate, state.skipped_in_a_row)
     key = derive(state.key, Purpose.PERMUTATION, state.update)
@@ -87,7 +87,7 @@ def learn(
         "learning_rate": learner.learning_rate,
         "parameter_norm": optax.tree.norm(learner.params),
     }
-    known = batch.old_value, batch.target, batch.weight
+    known = batch.old_value, batch.target, batch.valid
     metrics["explained_variance"] = losses.explained_variance(*known, parts)
     state = state.replace(params=learner.params, optimizer=learner.optimizer)
     rate, in_a_row = learner.learning_rate, learner.skipped_in_a_row
@@ -131,11 +131,11 @@ def minibatch_moments(batch: Batch, order: Array, parts: Parts) -> Moments:
       parts: how the V parts are computed.
     """
 
-    def of_each(advantage: Array, weight: Array, order: Array) -> Moments:
-        advantage, weight = (jnp.take(x, order, axis=1) for x in (advantage, weight))
-        return jax.vmap(moments_of, in_axes=1)(advantage, weight > 0)  # of [T', K, M]
+    def of_each(advantage: Array, valid: Array, order: Array) -> Moments:
+        advantage, valid = (jnp.take(x, order, axis=1) for x in (advantage, valid))
+        return jax.vmap(moments_of, in_axes=1)(advantage, valid)  # of [T', K, M]
 
-    found = parts.map(of_each, batch.advantage, batch.weight, order)
+    found = parts.map(of_each, batch.advantage, batch.valid, order)
     return pool(parts.gather(found))
 
 
@@ -204,13 +204,13 @@ def loss(
     }
     # Over all parts' samples, not this one's: so shares of a mean add up to the mean.
     count = jnp.maximum(advantage_moments.num_samples.astype(jnp.float32), 1.0)
-    means = {k: (batch.weight * term).sum() / count for k, term in terms.items()}
-    size = batch.raw_action.shape[-1]
-    bonus = losses.bounded_entropy(terms["entropy"], size, config.entropy_target)
+    entropy, size = terms["entropy"], batch.raw_action.shape[-1]
+    terms["bonus"] = losses.bounded_entropy(entropy, size, config.entropy_target)
+    means = {k: jnp.where(batch.valid, x, 0.0).sum() / count for k, x in terms.items()}
     objective = (
         means["policy_loss"]
         + config.value_weight * means["value_loss"]
-        - config.entropy_weight * (batch.weight * bonus).sum() / count
+        - config.entropy_weight * means.pop("bonus")
     )
     return objective, means
 

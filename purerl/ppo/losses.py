@@ -1,7 +1,7 @@
 """The PPO objective (Schulman et al. 2017, arXiv:1707.06347), as functions of plain arrays.
 
-Nothing here takes a mean: the learner weights each sample and adds up, because it may hold only a
-part of a minibatch.
+Nothing here takes a mean: the learner adds up over the samples that count, because it may hold
+only a part of a minibatch.
 """
 
 import math
@@ -85,20 +85,20 @@ def approximate_kl(log_ratio: Array) -> Array:
     return jnp.expm1(log_ratio) - log_ratio
 
 
-def explained_variance(value: Array, target: Array, weight: Array, parts: Parts) -> Array:
+def explained_variance(value: Array, target: Array, valid: Array, parts: Parts) -> Array:
     """Returns 1 - Var(target - value) / Var(target), []; 1 is perfect, 0 no better than a constant.
 
     Args:
       value: [V, ...] of V parts.
       target: [V, ...] what the value should have been.
-      weight: [V, ...] 1 where a sample counts, else 0.
+      valid: [V, ...] bool: which samples count.
       parts: how the V parts are computed.
     """
-    chex.assert_equal_shape([value, target, weight])
-    chex.assert_type([value, target, weight], float)
+    chex.assert_equal_shape([value, target, valid])
+    chex.assert_type([value, target, valid], [float, float, bool])
 
-    def both(value: Array, target: Array, weight: Array) -> Moments:
-        return moments_of({"error": target - value, "target": target}, weight > 0)
+    def both(value: Array, target: Array, valid: Array) -> Moments:
+        return moments_of({"error": target - value, "target": target}, valid)
 
-    variance = pool(parts.gather(parts.map(both, value, target, weight))).variance
+    variance = pool(parts.gather(parts.map(both, value, target, valid))).variance
     return 1.0 - variance["error"] / jnp.maximum(variance["target"], 1e-8)

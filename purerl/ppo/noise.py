@@ -36,7 +36,7 @@ def action_noise(
     # Folded with the step and then with the environment's id, so a rollout's noise does not depend
     # on which environments are computed together.
     def draw(t: Array) -> Array:
-        return white(jax.random.fold_in(key, t), state.number, size)
+        return white(jax.random.fold_in(key, t), state.env_ids, size)
 
     if not config.noise_color:
         return lambda t: (draw(t), None)

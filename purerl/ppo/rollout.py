@@ -31,8 +31,9 @@ class Transition(NamedTuple):
     terminated: Array  # [...] bool
     done: Array  # [...] bool: terminated, truncated or lost; the next row is another episode
     truncated: Array  # [...] bool
-    truncation_value: Array  # [...] V(s'_t) where truncated, else 0
+    next_value: Array  # [...] V(s'_t), before any reset; another's where terminated or lost
     valid: Array  # [...] bool: False where the physics blew up
+    is_first: Array  # [...] bool: an episode begins here
 
 
 class RolloutState(NamedTuple):
@@ -48,7 +49,7 @@ class RolloutState(NamedTuple):
 def truncation_values(
     network: Network, state: TrainState, env_state: State, memory: PyTree, truncated: Array
 ) -> Array:
-    """Returns V(s'_t) where an episode was truncated, else 0, [B].
+    """Returns V(s'_t) [B]; what stands where no episode was truncated is not to be read.
 
     Args:
       network: the policy and value function.
@@ -59,8 +60,7 @@ def truncation_values(
     """
 
     def values() -> Array:
-        output, _ = episodes.act(network, state, env_state, memory)
-        return jnp.where(truncated, output.value, 0.0)  # drops those of lost environments, too
+        return episodes.act(network, state, env_state, memory)[0].value
 
     # From the observation before the reset, which no batch ever holds; and only in steps where some
     # environment was truncated.
@@ -69,7 +69,7 @@ def truncation_values(
 
 def rollout(
     config: Config, env: Env, network: Network, state: TrainState
-) -> tuple[TrainState, Transition, Metrics, Array]:
+) -> tuple[TrainState, Transition, Metrics]:
     """Acts for T steps in the environments of `state`.
 
     Args:
@@ -80,29 +80,34 @@ def rollout(
 
     Returns:
       `state` with environments, memory and running episodes moved on; the transitions [T, B, ...];
-      sums over the episodes that ended, name -> [B]; the value of the last observation [B].
+      sums over the episodes that ended, name -> [B].
     """
     # One fresh start for each environment and update, made before the loop. Inside it, `vmap` would
     # compute a reset in every step, whether an episode ended or not. An environment whose episodes
     # end twice in an update begins again as it did before; `replayed_resets` counts that.
-    reset_keys = per_environment(derive(state.key, Purpose.RESET, state.update), state.number)
-    # The fold with 0 does nothing that is needed. It goes at the next change of bits.
-    fresh = jax.vmap(lambda key: env.reset(jax.random.fold_in(key, 0)))(reset_keys)
+    reset_keys = per_environment(derive(state.key, Purpose.RESET, state.update), state.env_ids)
+    fresh = jax.vmap(env.reset)(reset_keys)
     noise = action_noise(config, state, env.action_size)
 
     def step(now: RolloutState, t: Array) -> tuple[RolloutState, Transition]:
         white, conditional = noise(t)
         return _step(config, env, network, state, fresh, now, white, conditional)
 
-    never = jnp.zeros(state.number.shape, bool)
+    never = jnp.zeros(state.env_ids.shape, bool)
     nothing = episodes.episode_sums(state.episode, never, never)
-    start = RolloutState(state.env, state.carry, state.episode, state.discounted_return, nothing)
+    start = RolloutState(
+        state.env_state, state.memory, state.episode, state.discounted_return, nothing
+    )
     # Parameters and statistics are those of `state` in every step: only `RolloutState` moves.
     end, transitions = jax.lax.scan(step, start, jnp.arange(config.rollout_length))
     output, _ = episodes.act(network, state, end.env_state, end.memory)
-    state = state.replace(env=end.env_state, carry=end.memory, episode=end.episode)
+    state = state.replace(env_state=end.env_state, memory=end.memory, episode=end.episode)
     state = state.replace(discounted_return=end.discounted_return)
-    return state, transitions, end.sums, output.value
+    # The next row's value is that of s'_t, unless an episode ended. Where one was truncated, its
+    # step has kept V(s'_t). Where one terminated or was lost, `gae` does not read it.
+    following = jnp.concatenate([transitions.value[1:], output.value[None]])
+    following = jnp.where(transitions.truncated, transitions.next_value, following)
+    return state, transitions._replace(next_value=following), end.sums
 
 
 def _step(
@@ -140,7 +145,8 @@ def _step(
     done = terminated | truncated | lost
     reward = jnp.where(lost, 0.0, env_state.reward)
     discounted_return = config.gamma * now.discounted_return + reward
-    # No row of the batch may hold a NaN, not even one of weight 0, since 0 times NaN is NaN. The
+    # No row of the batch may hold a NaN, not even one that does not count: gradients multiply by 0,
+    # and 0 times NaN is NaN. The
     # observation before a lost step is one if a fresh start was. A value that is a number stays:
     # the step before bootstraps from it.
     seen = now.env_state.observation, raw, distributions.log_prob(distribution, raw)
@@ -156,8 +162,9 @@ def _step(
         terminated=terminated,
         done=done,
         truncated=truncated,
-        truncation_value=truncation_values(network, state, env_state, memory, truncated),
+        next_value=truncation_values(network, state, env_state, memory, truncated),
         valid=~lost,
+        is_first=now.episode.length == 0,
     )
     # Everything above is of the episode that the step belongs to; from here on, of the next one.
     following = RolloutState(
@@ -165,7 +172,7 @@ def _step(
         memory=jax.tree.map(lambda x: episodes.select(done, jnp.zeros_like(x), x), memory),
         episode=episodes.select(
             done,
-            episodes.start_episodes(fresh, episodes.time_limits(config, state.number)),
+            episodes.start_episodes(fresh, episodes.time_limits(config, state.env_ids)),
             episode,
         ),
         discounted_return=jnp.where(done, 0.0, discounted_return),

@@ -30,7 +30,7 @@ def policy_function(run: Run) -> PolicyFunction:
     network, state = run.network, run.state
     shapes = jax.eval_shape(run.env.reset, jax.random.key(0)).observation
     everything = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    memory = jax.tree.map(lambda x: x[0], start_memory(state.carry, 1))
+    memory = jax.tree.map(lambda x: x[0], start_memory(state.memory, 1))
 
     def act(observation: PyTree, memory: PyTree) -> tuple[Array, PyTree]:
         seen = running_moments.normalize(state.normalizer, observation)

@@ -77,7 +77,7 @@ class Policy:
         """
         batch, flat = _flatten(observation, self._example)
         if self._memory is None:
-            self._memory, self._batch = start_memory(self._state.carry, math.prod(batch)), batch
+            self._memory, self._batch = start_memory(self._state.memory, math.prod(batch)), batch
         elif batch != self._batch and jax.tree.leaves(self._memory):
             raise UserError(
                 f"The policy remembers environments {list(self._batch)}, and the observation is "

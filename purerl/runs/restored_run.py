@@ -74,7 +74,7 @@ def read_checkpoint(folder: Path, update: str, setup: Setup, say: Say) -> checkp
 
 def _read_checkpoint(run: Folder, update: str, setup: Setup, say: Say) -> checkpoint.Saved:
     abstract = abstract_state(*setup[:3])
-    abstract = abstract.replace(env=None, episode=None, optimizer=None)
+    abstract = abstract.replace(env_state=None, episode=None, optimizer=None)
     _check_memory(run.path, memory.size(abstract))
     return _choose(run, update, abstract, say)
 

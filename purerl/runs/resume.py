@@ -16,9 +16,11 @@ from purerl.experiment.source_hashes import hash_code
 from purerl.machine.files import draft_of
 from purerl.ppo.config import Config
 from purerl.runs import manifest
-from purerl.runs.folder import CODE, CONFIG, OURS, Folder, check_manifest
+from purerl.runs.folder import CODE, CONFIG, OURS, Folder, allowed_changes, check_manifest
 
 EDITED = "fingerprint: config.json, manifest.json or experiment.py is not what the run wrote"
+# What a line of a change begins with that may change the reward, or how it is discounted.
+OF_REWARD = ("settings.env.", "settings.ppo.gamma:", "source.", f"{CODE}:", "model:")
 MANY = 9  # edited files, which a refusal to resume then counts and does not list
 
 
@@ -186,6 +188,12 @@ def _shortened(found: list[str]) -> list[str]:
     threads = [line.split()[1] for line in found if line.startswith(pin)]
     found = manifest.count_files(found, MANY, ", as of another version of purerl")
     return found + [f"(NPROC={number} brings {pin} back)" for number in threads]
+
+
+def begins_stage(folder: Folder, update: int) -> bool:
+    """Tells whether a run goes on after `update` with what may be another reward."""
+    noted = (x["changes"] for x in allowed_changes(folder) if x["after_update"] == update)
+    return any(line.startswith(OF_REWARD) for lines in noted for line in lines)
 
 
 def _identity(folder: Folder) -> dict[str, str]:

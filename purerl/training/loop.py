@@ -213,7 +213,7 @@ def _why_lost(state: TrainState, records: Sequence[Record], seed: int) -> str:
     if math.isnan(record["train/reward"]):
         return (
             "No step of an update was sound: of each, some number of the state is NaN or absurd, "
-            f"which `purerl.check_env(env)` names. {lost_part(state.env)}"
+            f"which `purerl.check_env(env)` names. {lost_part(state.env_state)}"
         ).strip()
     skipped = record["train/skipped_in_a_row"]
     if skipped < MAX_SKIPPED_IN_A_ROW:

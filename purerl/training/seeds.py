@@ -34,10 +34,11 @@ from purerl.machine.command_errors import tell
 from purerl.machine.files import disk_errors
 from purerl.machine.lock import FolderLock
 from purerl.machine.output import Say
+from purerl.ppo.algorithm import start_stage
 from purerl.runs import checkpoint, checkpoint_folder, identity, manifest
 from purerl.runs.folder import CHECKPOINTS, Folder, check_manifest, note
 from purerl.runs.metrics_file import MetricsFile, Record, keep_whole_lines
-from purerl.runs.resume import with_change
+from purerl.runs.resume import begins_stage, with_change
 from purerl.training import console, loop
 from purerl.training.loggers import open_loggers
 from purerl.training.plan import Plan
@@ -123,7 +124,7 @@ def _train_together(job: Job, seeds: list[Seed], programs: Callable[[], Programs
         for one in saved:
             say(f"Resuming after update {one.meta['update']}. Digest {one.meta['digest']}")
         state = _first_state(known["found"], saved, seeds, job, compiled)
-        tell_first(None if known["found"] else state.env, say)
+        tell_first(None if known["found"] else state.env_state, say)
         writers: list[Any] = [processes.Silent(seed.path / CHECKPOINTS) for seed in seeds]
         if processes.is_first():
             with disk_errors():
@@ -176,8 +177,14 @@ def _first_state(
 
     if not found:
         return programs.init(together([jax.random.key(seed.number) for seed in seeds]))
-    state = together([one.state for one in saved]) if saved else None
+    state = together(list(map(_as_it_goes_on, seeds, saved))) if saved else None
     return processes.state_of_first(state, job.abstract)
+
+
+def _as_it_goes_on(seed: Seed, saved: checkpoint.Saved) -> TrainState:
+    """Returns a saved state; where a stage begins, ready for its reward."""
+    begins = seed.folder and begins_stage(seed.folder, saved.meta["update"])
+    return start_stage(saved.state) if begins else saved.state
 
 
 def _open_writers(

@@ -106,7 +106,7 @@ def _choose_shards(
     try:
         check_shards(shards, config.num_envs)
         name = "num_envs / num_shards" if number > 1 else "num_envs"
-        check_minibatches(config, is_recurrent(abstract.carry), config.num_envs // number, name)
+        check_minibatches(config, is_recurrent(abstract.memory), config.num_envs // number, name)
     except ValueError as error:
         raise UserError(str(error)) from error
     return shards

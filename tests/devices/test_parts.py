@@ -32,9 +32,9 @@ def columns(recurrent):
     """All columns of a rollout in 12 environments, [T', C], and what made them."""
     config = dataclasses.replace(CONFIG, num_envs=12)
     env, network, state = setup(config, recurrent=recurrent)
-    memory = state.carry  # before the rollout
-    after, transitions, _, last_value = ROLLOUT(config, env, network, state)
-    batch = BATCH(config, after, transitions, last_value, state.episode.length == 0)
+    memory = state.memory  # before the rollout
+    after, transitions, _ = ROLLOUT(config, env, network, state)
+    batch = BATCH(config, after, transitions)
     return config, network, after, batch if recurrent else batches.in_one_row(batch), memory
 
 
@@ -51,7 +51,7 @@ def gradient_step(recurrent, number, parts):
         begin = learner.Learner(
             state.params, state.optimizer, state.learning_rate, state.skipped_in_a_row
         )
-        size = pieces.weight.shape[2]
+        size = pieces.valid.shape[2]
         order = jnp.tile(jnp.arange(size), (number, 1, 1))  # one minibatch of all columns
         scale = jax.tree.map(lambda x: x[0], learner.minibatch_moments(pieces, order, parts))
         return learner.minibatch_step(config, network, begin, pieces, memories, scale, parts)
@@ -93,17 +93,17 @@ def test_advantages_of_a_minibatch_are_scaled_by_its_own(name):
     number, parts = CUTS[name]
     shape = (number, 1, 12)
     advantage = jax.random.normal(jax.random.key(0), shape) * 3.0 + 1.0
-    weight = jax.random.bernoulli(jax.random.key(1), 0.8, shape).astype(jnp.float32)
-    batch = batches.Batch(*[advantage] * 9)._replace(weight=weight, noise=None)
+    valid = jax.random.bernoulli(jax.random.key(1), 0.8, shape)
+    batch = batches.Batch(*[advantage] * 9)._replace(valid=valid, noise=None)
     order = learner.shuffle(jax.random.key(2), jnp.arange(number), 12, 3)
     found = learner.minibatch_moments(batch, order, parts)
     for k in range(3):
         taken = [
             np.asarray(x)[v, 0][np.asarray(order)[v, k]]
-            for x in (advantage, weight)
+            for x in (advantage, valid)
             for v in range(number)
         ]
-        values, counts = np.concatenate(taken[:number]), np.concatenate(taken[number:]) > 0
+        values, counts = np.concatenate(taken[:number]), np.concatenate(taken[number:])
         assert found.num_samples[k] == counts.sum()
         np.testing.assert_allclose(found.mean[k], values[counts].mean(), rtol=1e-4)
         np.testing.assert_allclose(found.variance[k], values[counts].var(), rtol=1e-4)
@@ -129,12 +129,13 @@ def test_slices_hold_whole_environments():
     env, network, state = setup()
     experience = COLLECT(CONFIG, env, network, state)[1]
     sliced = cut_in_slices(3, experience)
-    assert sliced.batch.weight.shape == (3, 16, 2) and sliced.env_ids.tolist() == [
+    assert sliced.transitions.valid.shape == (3, 16, 2) and sliced.env_ids.tolist() == [
         [0, 1], [2, 3], [4, 5],
     ]  # fmt: skip
     for i in range(3):
         np.testing.assert_array_equal(
-            sliced.batch.raw_action[i], experience.batch.raw_action[0, :, 2 * i : 2 * i + 2]
+            sliced.transitions.raw_action[i],
+            experience.transitions.raw_action[0, :, 2 * i : 2 * i + 2],
         )
     assert sliced.sums is experience.sums
 
@@ -151,9 +152,9 @@ def test_on_a_gpu_an_update_is_two_programs_that_make_the_same(recurrent, monkey
     )
     assert set(compiled.seconds) == {"collect", "improve"}
     updated, seen = compiled.update(jax.tree.map(jnp.copy, state))
-    leaves = jax.tree.leaves((seen, updated.params, updated.optimizer, updated.env.physics))
+    leaves = jax.tree.leaves((seen, updated.params, updated.optimizer, updated.env_state.physics))
     originals = jax.tree.leaves(
-        (metrics, expected.params, expected.optimizer, expected.env.physics)
+        (metrics, expected.params, expected.optimizer, expected.env_state.physics)
     )
     for x, y in zip(leaves, originals, strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5)

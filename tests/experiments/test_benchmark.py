@@ -52,7 +52,7 @@ def test_only_the_parts_asked_for_are_compiled(small):
 
 
 def test_bare_physics_moves_every_environment(small):
-    before, after = small.state.env.physics, small.parts[0].call()
+    before, after = small.state.env_state.physics, small.parts[0].call()
     assert (np.asarray(after.qpos) != np.asarray(before.qpos)).any(axis=1).all()
     np.testing.assert_allclose(after.time - before.time, 2 * 2 * 0.01, atol=1e-6)
 

@@ -90,7 +90,7 @@ def compute(setup: Setup, given: dict[str, PyTree]) -> dict[str, PyTree]:
     """Returns where a control step ends, and the parameters and metrics of what is learned."""
     config, env, network, _ = setup
     state = given["state"]
-    step = jax.jit(jax.vmap(env.step))(state.env, given["action"])
+    step = jax.jit(jax.vmap(env.step))(state.env_state, given["action"])
     learned, metrics = jax.jit(partial(algorithm.improve, config, network))(
         state, given["experience"]
     )

@@ -61,6 +61,25 @@ class Probe:
 
 
 @dataclass(frozen=True)
+class Point:
+    """A point in the plane that must come to the origin, with a reward for being alive."""
+
+    alive: float
+    control_timestep: float = 1.0
+    action_size: int = 2
+
+    def reset(self, key: Array) -> State:
+        return self._at(jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0))
+
+    def step(self, state: State, action: Array) -> State:
+        return self._at(state.observation + 0.1 * action)
+
+    def _at(self, place: Array) -> State:
+        reward = 1.0 - jnp.linalg.norm(place) + self.alive
+        return _state(place, reward, jnp.zeros((), bool), {})
+
+
+@dataclass(frozen=True)
 class EngineProbe(Probe):
     """A probe that counts its steps under its engine's name."""
 

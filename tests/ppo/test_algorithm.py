@@ -40,6 +40,7 @@ class Walk:
 
     edge: float = 1e3
     cliff: float = 1e3
+    unit: float = 1.0  # of the reward
     control_timestep: float = 1.0
     action_size: int = 1
 
@@ -49,7 +50,7 @@ class Walk:
 
     def step(self, state, action):
         x = state.physics["x"] + action[0]
-        return self.state(x, x - state.physics["x"], state.task["start"])
+        return self.state(x, self.unit * (x - state.physics["x"]), state.task["start"])
 
     def state(self, x, reward, start):
         broken = jnp.where(jnp.abs(x) > self.cliff, jnp.nan, x)
@@ -104,7 +105,7 @@ def test_the_first_ratio_is_one(recurrent, color):
 
 def test_statistics_are_frozen_until_the_end_of_the_update():
     env, network, state = setup()
-    after, transitions, _, _ = ROLLOUT(CONFIG, env, network, state)
+    after, transitions, _ = ROLLOUT(CONFIG, env, network, state)
     assert count_as_int(after.normalizer.count) == 50
     updated, _ = UPDATE(CONFIG, env, network, state)
     assert count_as_int(updated.normalizer.count) == 50 + 6 * 16
@@ -118,7 +119,7 @@ def test_time_limits_truncate_and_the_first_are_staggered():
     env, network, state = setup()
     limits = np.asarray(state.episode.limit)
     assert len(set(limits.tolist())) > 2 and limits.max() <= LENGTH and limits.min() >= 1
-    _, transitions, finished, _ = ROLLOUT(CONFIG, env, network, state)
+    _, transitions, finished = ROLLOUT(CONFIG, env, network, state)
     done = np.asarray(transitions.done)
     for b in range(6):
         ends = np.flatnonzero(done[:, b]) + 1
@@ -135,25 +136,25 @@ def test_training_episodes_have_limits_from_the_shortest_to_whole_ones_each_envi
     state = algorithm.init(config, env, network, jax.random.key(4))
     own = [2, 3, 3, 4, 5, 7]  # 2 * (7 / 2) ** (i / 5), to the nearest
     assert (np.asarray(state.episode.limit) <= own).all()
-    _, transitions, _, _ = ROLLOUT(config, env, network, state)
+    _, transitions, _ = ROLLOUT(config, env, network, state)
     for b in range(6):
         ends = np.flatnonzero(np.asarray(transitions.truncated)[:, b]) + 1
         assert ends[0] == state.episode.limit[b]
         assert (np.diff(ends) == own[b]).all()
-    part = state.replace(number=jnp.array([4, 1]))  # of a shard: numbers of the whole
-    np.testing.assert_array_equal(time_limits(config, part.number), [5, 3])
+    part = state.replace(env_ids=jnp.array([4, 1]))  # of a shard: numbers of the whole
+    np.testing.assert_array_equal(time_limits(config, part.env_ids), [5, 3])
     for none in (0, LENGTH, LENGTH + 1):  # a planner, too, shortens episodes and asks no one
         whole = dataclasses.replace(config, shortest_episode=none)
-        np.testing.assert_array_equal(time_limits(whole, part.number), [LENGTH, LENGTH])
+        np.testing.assert_array_equal(time_limits(whole, part.env_ids), [LENGTH, LENGTH])
 
 
 def test_every_environment_and_update_has_a_fresh_start():
     """One that ends twice in an update begins again as it began before, and that is counted."""
     env, network, state = setup()
     update = partial(UPDATE, CONFIG, env, network)
-    starts = set(np.asarray(state.env.physics["x"]).tolist())
+    starts = set(np.asarray(state.env_state.physics["x"]).tolist())
     for _ in range(2):
-        _, transitions, _, _ = ROLLOUT(CONFIG, env, network, state)
+        _, transitions, _ = ROLLOUT(CONFIG, env, network, state)
         done = np.asarray(transitions.done)[:-1]
         begins = np.asarray(transitions.observation)[1:, :, 0]
         for b in range(6):
@@ -194,8 +195,8 @@ def slow_batch(transitions, last_value, observations_before_reset, value_of, gam
 
 def test_truncation_bootstraps_from_the_observation_before_the_reset():
     env, network, state = setup(env=Walk(edge=1.5))
-    after, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
-    batch = batches.make_batch(CONFIG, state, transitions, last_value, state.episode.length == 0)
+    after, transitions, _ = ROLLOUT(CONFIG, env, network, state)
+    batch = batches.make_batch(CONFIG, state, transitions)
     transitions = jax.tree.map(np.asarray, transitions)
     assert transitions.terminated.any() and transitions.truncated.any()
     moved = transitions.observation[..., 0] + np.tanh(transitions.raw_action[..., 0])
@@ -205,9 +206,8 @@ def test_truncation_bootstraps_from_the_observation_before_the_reset():
         features = running_moments.normalize(state.normalizer, jnp.asarray(observation))
         return float(network.apply(state.params, features, ())[0].value)
 
-    expected = slow_batch(
-        transitions, np.asarray(last_value), before_reset, value_of, 0.9, CONFIG.gae_lambda
-    )
+    last_value = [value_of(seen) for seen in after.env_state.observation]
+    expected = slow_batch(transitions, last_value, before_reset, value_of, 0.9, CONFIG.gae_lambda)
     np.testing.assert_allclose(batch.advantage, expected, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(batch.target, expected + transitions.value, rtol=1e-4, atol=1e-5)
     is_first = np.asarray(batch.is_first)
@@ -222,11 +222,10 @@ def test_recurrent_memory_restarts_with_each_episode_in_rollout_and_learner():
     update = partial(UPDATE, CONFIG, env, network)
     for _ in range(2):  # so that memories are not zero when the rollout begins
         state, _ = update(state)
-    assert jnp.abs(state.carry).max() > 0
-    _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
-    is_first = state.episode.length == 0
-    batch = batches.make_batch(CONFIG, state, transitions, last_value, is_first)
-    output = learner.unroll(network, state.params, batch, state.carry)
+    assert jnp.abs(state.memory).max() > 0
+    _, transitions, _ = ROLLOUT(CONFIG, env, network, state)
+    batch = batches.make_batch(CONFIG, state, transitions)
+    output = learner.unroll(network, state.params, batch, state.memory)
     np.testing.assert_allclose(output.value, transitions.value, rtol=1e-5, atol=1e-6)
     # By hand: at a start the memory is zero.
     t, b = np.argwhere(np.asarray(batch.is_first)[1:])[0] + [1, 0]
@@ -258,14 +257,14 @@ def test_a_start_that_is_no_number_costs_its_own_step_alone(recurrent):
 
 
 def test_a_blown_up_environment_is_contained():
-    """Environment 3 goes NaN: counted, reset, weight 0; the others' bits are the same."""
+    """Environment 3 goes NaN: counted, reset, not learned from; the others' bits are the same."""
     sound_env, network, state = setup()
     # The last moves of environment 3 alone lead beyond the cliff.
-    x = state.env.physics["x"].at[3].set(40.0)
-    state = state.replace(env=state.env.replace(physics={"x": x}))
+    x = state.env_state.physics["x"].at[3].set(40.0)
+    state = state.replace(env_state=state.env_state.replace(physics={"x": x}))
     broken_env = Walk(cliff=39.5)
-    after, sound, _, _ = ROLLOUT(CONFIG, sound_env, network, state)
-    contained, lost, finished, _ = ROLLOUT(CONFIG, broken_env, network, state)
+    after, sound, _ = ROLLOUT(CONFIG, sound_env, network, state)
+    contained, lost, finished = ROLLOUT(CONFIG, broken_env, network, state)
     assert (~np.asarray(lost.valid)).sum(0).tolist()[3] >= 1
     assert (
         finished["nonfinite_resets"].sum() == (~lost.valid).sum() == finished["nonfinite_resets"][3]
@@ -276,7 +275,7 @@ def test_a_blown_up_environment_is_contained():
     for a, b in zip(jax.tree.leaves(sound), jax.tree.leaves(lost), strict=True):
         others = [0, 1, 2, 4, 5]
         np.testing.assert_array_equal(np.asarray(a)[:, others], np.asarray(b)[:, others])
-    for leaf in jax.tree.leaves((lost, contained.env, contained.episode)):
+    for leaf in jax.tree.leaves((lost, contained.env_state, contained.episode)):
         assert np.isfinite(np.asarray(leaf, np.float64)).all()
     updated, metrics = UPDATE(CONFIG, broken_env, network, state)
     assert metrics["nonfinite_resets"] >= 1 and metrics["skipped_minibatches"] == 0
@@ -289,7 +288,7 @@ def test_a_blown_up_environment_is_contained():
 def test_a_lost_sample_has_no_weight_in_the_update():
     """Whatever stands in the lost rows, the gradient is the same."""
     env, network, state = setup()
-    _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
+    _, transitions, _ = ROLLOUT(CONFIG, env, network, state)
     valid = transitions.valid.at[5, 2].set(False)
     done = transitions.done.at[5, 2].set(True)
     lost = transitions._replace(valid=valid, done=done)
@@ -298,7 +297,7 @@ def test_a_lost_sample_has_no_weight_in_the_update():
     )
     learned = []
     for x in (lost, odd):
-        batch = batches.make_batch(CONFIG, state, x, last_value, state.episode.length == 0)
+        batch = batches.make_batch(CONFIG, state, x)
         learned.append(learn(CONFIG, network, state, batch, ())[0])
     for a, b in zip(*(jax.tree.leaves(x.params) for x in learned), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -308,8 +307,8 @@ def test_a_lost_sample_has_no_weight_in_the_update():
 def test_advantages_are_clipped_after_they_are_normalized(least, clip):
     """The first ratio is 1: the loss of one minibatch is minus the mean of what it was given."""
     env, network, state = setup()
-    _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
-    batch = batches.make_batch(CONFIG, state, transitions, last_value, state.episode.length == 0)
+    _, transitions, _ = ROLLOUT(CONFIG, env, network, state)
+    batch = batches.make_batch(CONFIG, state, transitions)
     advantage = jnp.linspace(-1.0, 1.0, 96).reshape(16, 6).at[5, 2].set(-30.0)  # one failure
     config = dataclasses.replace(
         CONFIG, num_epochs=1, num_minibatches=1, advantage_clip=clip, min_advantage_std=least
@@ -325,8 +324,8 @@ def test_advantages_are_clipped_after_they_are_normalized(least, clip):
 
 def test_the_entropy_bonus_leaves_a_policy_alone_that_is_above_its_target():
     env, network, state = setup()
-    _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
-    batch = batches.make_batch(CONFIG, state, transitions, last_value, state.episode.length == 0)
+    _, transitions, _ = ROLLOUT(CONFIG, env, network, state)
+    batch = batches.make_batch(CONFIG, state, transitions)
 
     def moved(**settings):
         config = dataclasses.replace(CONFIG, num_epochs=1, num_minibatches=1, **settings)
@@ -411,21 +410,21 @@ def test_a_memory_may_hold_integers():
     )._replace(apply=apply)
     state = INIT(CONFIG, Walk(), counting, jax.random.key(0))
     state, metrics = UPDATE(CONFIG, Walk(), counting, state)
-    assert state.carry["count"].dtype == jnp.int32 and metrics["skipped_minibatches"] == 0
+    assert state.memory["count"].dtype == jnp.int32 and metrics["skipped_minibatches"] == 0
     evaluation.evaluate_policy(Walk(), counting, state, jax.random.key(1), 2, LENGTH)
 
 
 def test_a_non_finite_minibatch_is_skipped_and_counted():
     env, network, state = setup()
-    _, transitions, _, last_value = ROLLOUT(CONFIG, env, network, state)
+    _, transitions, _ = ROLLOUT(CONFIG, env, network, state)
     broken = transitions._replace(reward=transitions.reward.at[:].set(jnp.nan))
-    batch = batches.make_batch(CONFIG, state, broken, last_value, state.episode.length == 0)
+    batch = batches.make_batch(CONFIG, state, broken)
     after, metrics = learn(CONFIG, network, state, batch, ())
     assert metrics["skipped_minibatches"] == metrics["skipped_in_a_row"] == 6
     assert np.isfinite(metrics["policy_loss"])
     for a, b in zip(jax.tree.leaves(state.params), jax.tree.leaves(after.params), strict=True):
         np.testing.assert_array_equal(a, b)
-    sound = batches.make_batch(CONFIG, state, transitions, last_value, state.episode.length == 0)
+    sound = batches.make_batch(CONFIG, state, transitions)
     again, _ = learn(CONFIG, network, after, sound, ())
     assert again.skipped_in_a_row == 0
 
@@ -457,7 +456,7 @@ def test_reward_scaling_by_the_running_return():
     config = dataclasses.replace(CONFIG, reward_scaling="return_std")
     env, network, state = setup(config)
     assert batches.reward_factor(config, state) == 1.0
-    _, transitions, _, _ = ROLLOUT(config, env, network, state)
+    _, transitions, _ = ROLLOUT(config, env, network, state)
     state, _ = UPDATE(config, env, network, state)
     # By hand: G_t = gamma G_{t-1} + r_t, from 0 after each end.
     reward, done = np.asarray(transitions.reward), np.asarray(transitions.done)
@@ -467,6 +466,18 @@ def test_reward_scaling_by_the_running_return():
         returns.append(running.copy())
         running[d] = 0.0
     np.testing.assert_allclose(batches.reward_factor(config, state), 1 / np.std(returns), rtol=1e-4)
+
+
+def test_what_is_learned_does_not_depend_on_the_unit_of_rewards():
+    """Neither in the first update, nor in the first one of a stage whose reward is another."""
+    config = dataclasses.replace(CONFIG, reward_scaling="return_std", num_epochs=1)
+    env, network, first = setup(config)
+    later, _ = UPDATE(config, env, network, first)
+    for state in (first, algorithm.start_stage(later)):
+        learned = [UPDATE(config, Walk(unit=unit), network, state) for unit in (1.0, 1e4)]
+        one, other = (jax.tree.leaves(after.params) for after, _ in learned)
+        for x, y in zip(one, other, strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-5)
 
 
 def test_the_same_seed_learns_the_same_bits_and_another_does_not():

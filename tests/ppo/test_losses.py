@@ -95,8 +95,8 @@ def test_kl_estimate_is_unbiased_and_never_negative():
 
 
 def explained(value, target):
-    value, target, ones = value[None], target[None], jnp.ones((1, 3))  # one part
-    return losses.explained_variance(value, target, ones, WHOLE)
+    value, target, valid = value[None], target[None], jnp.ones((1, 3), bool)  # one part
+    return losses.explained_variance(value, target, valid, WHOLE)
 
 
 def test_explained_variance():

@@ -21,7 +21,7 @@ PINK = dataclasses.replace(CONFIG, noise_color=1.0)
 def noise_of(config, number, update=0):
     """A rollout's white noise [T, B, 3] of environments, and what is known of each step's."""
     state = SimpleNamespace(
-        key=jax.random.key(3), update=jnp.int32(update), number=jnp.asarray(number, jnp.int32)
+        key=jax.random.key(3), update=jnp.int32(update), env_ids=jnp.asarray(number, jnp.int32)
     )
     every = jax.jit(lambda: jax.vmap(action_noise(config, state, 3))(jnp.arange(64)))
     return jax.tree.map(np.asarray, every())

@@ -49,7 +49,7 @@ def as_on_the_page(state):
         state.optimizer,
         running(state.normalizer),
         running(state.reward_normalizer),
-        state.env,
+        state.env_state,
         state.episode.length,
         state.episode.limit,
         state.discounted_return,

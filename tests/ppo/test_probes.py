@@ -6,10 +6,18 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from purerl.ppo import advantages, algorithm, distributions, losses, networks, running_moments
+from purerl.ppo import (
+    advantages,
+    algorithm,
+    distributions,
+    evaluation,
+    losses,
+    networks,
+    running_moments,
+)
 from purerl.ppo.episodes import act
 from tests import quick
-from tests.ppo.probes import Probe
+from tests.ppo.probes import Point, Probe
 
 SMALL = networks.MlpOptions(policy_hidden=(32,), value_hidden=(32,))
 CONFIG = algorithm.Config.plain(
@@ -35,9 +43,9 @@ def train(config, env, network, seed=0):
 
 def answers(network, state, observations):
     """Values and deterministic actions for `observations` (list of numbers)."""
-    example = jax.tree.map(lambda x: x[: len(observations)], state.env)
+    example = jax.tree.map(lambda x: x[: len(observations)], state.env_state)
     shown = example.replace(observation=jnp.asarray(observations, jnp.float32)[:, None])
-    memory = jax.tree.map(lambda x: x[: len(observations)], state.carry)
+    memory = jax.tree.map(lambda x: x[: len(observations)], state.memory)
     output, _ = act(network, state, shown, memory)
     action = distributions.to_action(output.distribution.loc)
     return output.value.tolist(), action[:, 0].tolist()
@@ -124,6 +132,27 @@ def memory_error(build, options):
     )
     _, metrics = train(config, env, network)
     return float(-metrics["episode_return"])
+
+
+@pytest.mark.slow
+def test_a_bonus_for_being_alive_does_not_spoil_the_first_updates():
+    """Four seeds; with rewards that the first update does not divide, they have -100 here."""
+    env = Point(alive=1.0)
+    config = algorithm.Config(
+        num_steps=96_000, num_envs=64, rollout_length=50, episode_length=50,
+        shortest_episode=0, noise_color=0.0,
+    )  # fmt: skip
+    options = networks.MlpOptions(policy_hidden=(64, 64), value_hidden=(64, 64))
+    network = networks.mlp(options, jnp.zeros(2), 2)
+
+    def returns(seed):
+        state = algorithm.init(config, env, network, jax.random.key(seed))
+        update = partial(algorithm.update, config, env, network)
+        state, _ = jax.lax.scan(lambda state, _: update(state), state, None, 10)
+        judged = evaluation.evaluate_policy(env, network, state, jax.random.key(9), 32, 50)
+        return judged["episode_return"].mean() - 50.0  # of 50: at the origin from the start
+
+    assert jax.jit(jax.vmap(returns))(jnp.arange(1, 5)).min() > 40.0
 
 
 @pytest.mark.slow

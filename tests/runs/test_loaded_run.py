@@ -80,7 +80,7 @@ def test_one_observation_or_several_give_the_same(run):
     one = [run.policy(jax.tree.map(lambda x: x[1, 2], many)) for _ in range(2)]
     assert one[0].shape == (1,)
     np.testing.assert_allclose(one, [first[1, 2], second[1, 2]], rtol=1e-5, atol=1e-7)
-    remembers = len(jax.tree.leaves(run.state.carry)) > 0
+    remembers = len(jax.tree.leaves(run.state.memory)) > 0
     assert (np.abs(first - second).max() > 1e-6) == remembers
     if remembers:
         with pytest.raises(purerl.UserError, match=r"remembers environments \[\].*call reset"):

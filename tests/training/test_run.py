@@ -27,7 +27,7 @@ from purerl.experiment import objects
 from purerl.experiment.loading import find
 from purerl.machine import command_errors, files, state_arrays
 from purerl.ppo.config import Evaluation
-from purerl.runs import checkpoint, checkpoint_folder, folder as run_folder, resume
+from purerl.runs import checkpoint, checkpoint_folder, folder as run_folder, loaded_run, resume
 from purerl.training import console, train, writer
 
 TOY = Path(__file__).parent.parent / "runs" / "toy_experiment.py"
@@ -458,12 +458,14 @@ def test_a_run_begun_under_other_conditions_lists_them(tmp_path, stop_after, cap
     assert json.loads(file.read_text())["run_id"] == facts["run_id"] and "of" not in allowed[0]
 
 
-def test_a_copy_that_goes_on_otherwise_is_a_run_of_its_own(tmp_path):
+@pytest.mark.parametrize("changed, counted", [("ppo.learning-rate=3e-4", 24), ("env.steps=6", 12)])
+def test_a_copy_that_goes_on_otherwise_is_a_run_of_its_own(tmp_path, changed, counted):
+    """Another reward begins a stage, so the returns before it do not count any more."""
     start(tmp_path)
     first = json.loads((folder(tmp_path) / "manifest.json").read_text())
     copy = folder(tmp_path).with_name("wide")
     shutil.copytree(folder(tmp_path), copy)
-    words = ["--name", "wide", "--resume", "--allow-changes", "--ppo.learning-rate", "3e-4"]
+    words = ["--name", "wide", "--resume", "--allow-changes", f"--{changed}"]
     words += ["--ppo.num-steps", "799"]
     for _ in range(2):  # and stays it
         assert start(tmp_path, *words) == SUCCESS
@@ -471,6 +473,9 @@ def test_a_copy_that_goes_on_otherwise_is_a_run_of_its_own(tmp_path):
         assert second["run_id"] != first["run_id"] and second["name"] == "wide"
         (change,) = second["allowed_changes"]
         assert change["of"] == {"run_id": first["run_id"], "name": "seed1"}
+    assert (
+        loaded_run.load(copy).state.reward_normalizer.count.low == counted * 8 * 4
+    )  # updates, of 24
     assert json.loads((folder(tmp_path) / "manifest.json").read_text()) == first
 
 

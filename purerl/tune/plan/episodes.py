@@ -114,7 +114,7 @@ def episodes(
     others = judges or {}
 
     def first(learned: Any, key: Array) -> Playing:
-        nothing: Any = SimpleNamespace(carry=())  # the guide's memory is in the plan
+        nothing: Any = SimpleNamespace(memory=())  # the guide's memory is in the plan
         plan = planner.start(settings, env, make_guide(learned))
         plans = jax.tree.map(lambda x: jnp.broadcast_to(x, (number, *x.shape)), plan)
         return Playing(evaluation.start(env, nothing, key, number, config.episode_length), plans)

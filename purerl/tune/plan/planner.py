@@ -72,7 +72,7 @@ def guide(config: Config, network: Network, state: TrainState) -> Guide:
         output, memory = episodes.act(network, state, env, memory)
         return distributions.to_action(output.distribution.loc), output.value / factor, memory
 
-    memory = jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), state.carry)
+    memory = jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), state.memory)
     return Guide(act, memory, config.gamma)
 
 
