@@ -9,6 +9,7 @@ import numpy as np
 
 from purerl.checks import check_env
 from purerl.checks.check_traces import check_traces
+from purerl.checks.examine_model import check_model
 from purerl.checks.findings import Finding, error, ok, some, warning
 from purerl.checks.user_code import in_words, own_line
 from purerl.checks.watch_physics import check_controls, check_placed
@@ -43,6 +44,7 @@ def examine(env: Env, num_steps: int = NUM_STEPS) -> Iterator[Finding]:
     yield from check_trial(trial)
     yield from check_controls(env, trial)
     yield from check_placed(env)
+    yield from check_model(env, trial)
 
 
 def check_repeats(env: Env, trial: check_env.Trial) -> Finding:

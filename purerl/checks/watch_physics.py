@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from purerl.checks.check_env import Trial
-from purerl.checks.findings import Finding, ok, warning
+from purerl.checks.findings import Finding, error, ok, warning
 from purerl.core.env import Env, State
 from purerl.core.records import Array
 
@@ -21,22 +21,25 @@ class Seen(NamedTuple):
 
     controls: list[Array]  # [nu] that `step` was given
     states: list[Any]  # PhysicsState that `init` and `step` returned
+    calls: list[tuple]  # positional and named arguments
 
 
 @contextlib.contextmanager
 def watching(physics: Any) -> Iterator[Seen]:
     """Notes what `physics` is given and what it returns, as long as this lasts."""
-    seen = Seen([], [])
+    seen = Seen([], [], [])
 
     def init(*arguments: Any, **named: Any) -> Any:
         answer = type(physics).init(physics, *arguments, **named)
         seen.states.append(answer[0])
+        seen.calls.append((arguments, named))
         return answer
 
     def step(state: Any, ctrl: Array, *arguments: Any, **named: Any) -> Any:
         answer = type(physics).step(physics, state, ctrl, *arguments, **named)
         seen.controls.append(jnp.asarray(ctrl))
         seen.states.append(answer[0])
+        seen.calls.append(((state, ctrl, *arguments), named))
         return answer
 
     physics.init, physics.step = init, step
@@ -90,7 +93,7 @@ def _describe_controls(model: Any, given: np.ndarray) -> Finding:
 
 
 def check_placed(env: Env, num_envs: int = 4) -> list[Finding]:
-    """Warns of positions that reset changes in the state that `init` returned.
+    """Finds quaternions of zeros, and positions that reset changes after `init`.
 
     The first readings, and so the first observation, are of where things were before.
     """
@@ -98,17 +101,27 @@ def check_placed(env: Env, num_envs: int = 4) -> list[Finding]:
     if not hasattr(physics, "model"):
         return []
 
-    def places(key: Array) -> tuple[Any, Any]:
+    from purerl.physics.as_built import ZERO_ROTATION, has_zero_rotation
+
+    def places(key: Array) -> tuple[Any, Any, Any]:
         with watching(physics) as seen:
             after = env.reset(key).physics
         names = ("mocap_pos", "mocap_quat", "qpos", "qvel")
         before = seen.states[-1]
-        return {n: getattr(before, n) for n in names}, {n: getattr(after, n) for n in names}
+        (qpos, _, *rest), named = seen.calls[-1]
+        changes = rest[0] if rest else named.get("changes") or {}
+        zero = has_zero_rotation(physics.model, qpos, changes)
+        old, new = ({n: getattr(x, n) for n in names} for x in (before, after))
+        return zero, old, new
 
     try:
-        before, after = jax.jit(jax.vmap(places))(jax.random.split(jax.random.key(0), num_envs))
+        zero, before, after = jax.jit(jax.vmap(places))(
+            jax.random.split(jax.random.key(0), num_envs)
+        )
     except Exception:  # `physics` is something else, or in a trace of the user's own
         return []
+    if np.any(zero):
+        return [error("placing", ZERO_ROTATION)]
     moved = [name for name in before if (np.asarray(before[name]) != after[name]).any()]
     if not moved:
         return [ok("placing", "reset changes no position after init")]

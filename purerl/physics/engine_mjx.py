@@ -1,6 +1,7 @@
 """The `jax` engine: MJX, traced once, with every sum in a fixed order."""
 
 import contextlib
+import functools
 import io
 from typing import Any
 
@@ -18,6 +19,9 @@ with contextlib.redirect_stdout(io.StringIO()):  # it prints that warp, which is
 
 _IN_IMPL = ("cinert", "crb", "ten_velocity", "actuator_velocity", "subtree_linvel")
 _IN_IMPL += ("subtree_angmom", "cacc", "cfrc_int", "cfrc_ext")
+# What MuJoCo computes with the sensors of accelerations: under RK4 at the first of four stages,
+# where MJX has the last; forces and accelerations are the last stage's.
+_OF_SENSORS = ("sensordata", "cacc", "cfrc_int", "cfrc_ext")
 
 
 class JaxEngine:
@@ -36,18 +40,23 @@ class JaxEngine:
         `record` is the NamedTuple of readings; those that are `late` are of the last substep.
         `exact.rewrite` is told the `platform`, by default that of this process's first device.
         """
-        _check_known(model)
         self.record, self.late, self.substeps = record, late, substeps
         self.shapes = reading_shapes(model, record._fields)
         device = jax.local_devices()[0]  # MJX by itself takes the first of all processes
         with mjx_defaults():
             try:
                 self.model = mjx.put_model(model, device=device, impl="jax")
-            except NotImplementedError as error:
+                self.data = mjx.make_data(model, device=device, impl="jax")
+                senses = [sensor.sensor_pos, sensor.sensor_vel]
+                if late or not _forgets_sensors(self.data):
+                    senses.append(sensor.sensor_acc)
+                for sense in senses:
+                    jax.eval_shape(functools.partial(sense, self.model), self.data)
+            except (NotImplementedError, TypeError, ValueError, LookupError) as error:
                 raise ValueError(
-                    f"MJX cannot simulate this model: {error} Change the model, or use engine 'c'."
+                    f"MJX cannot simulate this model: {error} Change the model{_hint(model)}, or "
+                    "use engine 'c'."
                 ) from error
-            self.data = mjx.make_data(model, device=device, impl="jax")
         # MJX takes seconds to trace: reset, training and evaluation share one trace of each.
         platform = platform or device.platform
         self._exact_init = exact.rewrite(self.plain_init, platform=platform)
@@ -74,13 +83,17 @@ class JaxEngine:
     ) -> tuple[PyTree, tuple]:
         """Does what `step` does, with sums in any order."""
         model = self.model.tree_replace(changes) if changes else self.model
+        rk4 = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
 
         def substep(carry, _):
             data = _load_state(self.data, carry[0]).replace(ctrl=ctrl)
             after = mjx.step(model, data)
-            late = _forward(model, data, True) if self.late and _forgets_sensors(data) else after
+            first = after
+            if self.late and (rk4 or _forgets_sensors(data)):
+                first = _forward(model, data, True)
+            late = {n: after if rk4 and n not in _OF_SENSORS else first for n in self.late}
             state = carry[0].replace(**{n: getattr(after, n) for n in vars(carry[0])})
-            return (state, [_field_of(late, n) for n in self.late]), None
+            return (state, [_field_of(late[n], n) for n in self.late]), None
 
         start = [jnp.zeros(_field_of(self.data, n).shape) for n in self.late]
         (state, late), _ = jax.lax.scan(substep, (state, start), None, self.substeps)
@@ -93,22 +106,10 @@ class JaxEngine:
         return self.record(*(x.astype(jnp.float32) for x in read))
 
 
-def _check_known(model: mujoco.MjModel) -> None:
-    """Raises ValueError for what MJX leaves out silently: the motion would be another than C's."""
-    bits = (mujoco.mjtDisableBit.mjDSBL_SPRING, mujoco.mjtDisableBit.mjDSBL_DAMPER)
-    passive = [bool(model.opt.disableflags & int(bit)) for bit in bits]
-    left_out = {
-        f"noslip_iterations = {model.opt.noslip_iterations}": model.opt.noslip_iterations,
-        "only one of springs and dampers disabled": passive[0] != passive[1],
-    }
-    for what in ("jnt_stiffness", "dof_damping", "tendon_stiffness", "tendon_damping"):
-        left_out[f"a non-zero {what}poly"] = getattr(model, f"{what}poly").any()
-    for what, there in left_out.items():
-        if there:
-            raise ValueError(
-                f"The model has {what}, which MJX does not have and leaves out without a word: "
-                "remove it, on every engine, or use engine 'c'."
-            )
+def _hint(model: mujoco.MjModel) -> str:
+    """Tells what MJX's own words do not."""
+    rays = (model.sensor_type == mujoco.mjtSensor.mjSENS_RANGEFINDER).any()
+    return " (a rangefinder needs a <material> in it)" if rays and not model.nmat else ""
 
 
 def reading_shapes(model: mujoco.MjModel, names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:

@@ -13,6 +13,8 @@ from flax import struct
 import purerl
 from purerl.core.errors import unknown_name
 from purerl.core.records import Array, PyTree
+from purerl.physics.as_built import check_unedited, numbers, refuse_zero_rotations
+from purerl.physics.left_out import LEFT_OUT, check_left_out
 
 ENGINES = ("auto", "c", "jax", "warp")
 
@@ -129,9 +131,10 @@ class Physics:
             )
         self.engine = choose_engine(engine)
         _check_model(model, tuple(n for n in readings if n not in overflow_reading(self.engine)))
-        if substeps < 1:
-            raise ValueError(f"substeps is {substeps}: a control step needs at least 1.")
-        self.model, self.substeps = model, substeps
+        check_left_out(model, self.engine)
+        if not isinstance(substeps, int | np.integer) or substeps < 1:
+            raise ValueError(f"substeps is {substeps!r}: a control step has 1, 2, 3 or more.")
+        self.model, self.substeps, self._built = model, substeps, numbers(model, CHANGEABLE_FIELDS)
         self.control_timestep = substeps * float(model.opt.timestep)
         record: Any = collections.namedtuple("Readings", list(readings))  # type: ignore[misc]
         self._engine = _build_engine(self.engine, model, record, substeps)
@@ -143,6 +146,7 @@ class Physics:
         model, changes = self.model, self._check_changes(changes)
         _check_shape("qpos", qpos, (model.nq,))
         _check_shape("qvel", qvel, (model.nv,))
+        qpos = refuse_zero_rotations(model, qpos, changes)
         mocap = np.argsort(model.body_mocapid, kind="stable")[model.nbody - model.nmocap :]
         state = PhysicsState(
             qpos=_float32(qpos),
@@ -163,6 +167,7 @@ class Physics:
         return self._engine.step(state, _float32(ctrl), self._check_changes(changes))
 
     def _check_changes(self, changes: dict[str, Array] | None) -> dict[str, Array]:
+        check_unedited(self.model, self._built)
         for name, value in (changes or {}).items():
             if name not in CHANGEABLE_FIELDS:
                 what = "model field that can change"
@@ -179,8 +184,8 @@ def _check_has_effect(model: mujoco.MjModel, name: str, engine: str) -> None:
         missing = "some body"
     elif engine == "jax" and name.endswith("_frictionloss") and not value.all():
         missing = "all of them"
-    elif engine == "jax" and name.endswith("poly"):
-        raise ValueError(f"changes[{name!r}] does nothing on engine 'jax': MJX does not have it.")
+    elif name in LEFT_OUT[engine]:
+        raise ValueError(f"changes[{name!r}] does nothing on engine {engine!r}: it has no such.")
     else:
         return
     raise ValueError(

@@ -291,21 +291,6 @@ HINGE = """<mujoco>{0}<worldbody><body><joint type="hinge" axis="0 1 0" {1}/>
   <geom type="capsule" size=".05" fromto="0 0 0 .5 0 0"/></body></worldbody></mujoco>"""
 
 
-@pytest.mark.parametrize(
-    ("option", "joint", "message"),
-    [
-        ("", 'damping="0 2 1"', "non-zero dof_dampingpoly"),
-        ("", 'stiffness="0 5 50"', "non-zero jnt_stiffnesspoly"),
-        ('<option><flag spring="disable"/></option>', 'damping="2"', "only one of springs"),
-    ],
-)
-def test_what_mjx_would_leave_out_is_refused(option, joint, message):
-    model = mujoco.MjModel.from_xml_string(HINGE.format(option, joint))
-    Physics(model, (), 1, "c")
-    with pytest.raises(ValueError, match=message):
-        Physics(model, (), 1, "jax")
-
-
 def test_what_mjx_refuses_is_a_value_error():
     shapes = "<geom type='cylinder' size='.1 .1'/>", "<geom type='box' size='.1 .1 .1'/>"
     bodies = "".join(f"<body><freejoint/>{shape}</body>" for shape in shapes)
@@ -335,10 +320,6 @@ def test_wrong_names_and_shapes_are_explained():
         Physics(biped(off), ("sensordata",), engine="c")
     with pytest.raises(ValueError, match="add one of accelerometer"):
         Physics(suite.load("cartpole", "swingup").physics.model.ptr, ("cfrc_ext",), engine="c")
-    slip = biped.__wrapped__()  # its own
-    slip.opt.noslip_iterations = 3
-    with pytest.raises(ValueError, match="noslip_iterations = 3, which MJX does not have and"):
-        Physics(slip, (), engine="jax")
     p = physics("c")
     qpos, qvel = (x[0] for x in starts(1, p.model))
     with pytest.raises(ValueError, match="Did you mean 'geom_friction'"):
