@@ -68,7 +68,9 @@ def check_solver(env: Env, physics: Any, trial: Trial) -> Iterator[Finding]:
     except Exception:  # a trace of the user's own around the physics
         return
     good = np.isfinite(old + best).all(-1)
-    gap, moved = (np.abs(x - best)[good].max(initial=0.0) for x in (own, old))
+    if not good.any():
+        return
+    gap, moved = (np.abs(x - best)[good].max() for x in (own, old))
     what = f"{opt.iterations} iterations ({opt.ls_iterations} of line search)"
     said = f"after one control step qpos is up to {gap:.2g} from a converged solver's, by {what}"
     if gap <= SOLVED * moved:

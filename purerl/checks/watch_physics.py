@@ -108,9 +108,9 @@ def check_placed(env: Env, num_envs: int = 4) -> list[Finding]:
             after = env.reset(key).physics
         names = ("mocap_pos", "mocap_quat", "qpos", "qvel")
         before = seen.states[-1]
-        (qpos, _, *rest), named = seen.calls[-1]
-        changes = rest[0] if rest else named.get("changes") or {}
-        zero = has_zero_rotation(physics.model, qpos, changes)
+        arguments, named = seen.calls[-1]
+        given = {**dict(zip(("qpos", "qvel", "changes"), arguments, strict=False)), **named}
+        zero = has_zero_rotation(physics.model, given["qpos"], given.get("changes") or {})
         old, new = ({n: getattr(x, n) for n in names} for x in (before, after))
         return zero, old, new
 

@@ -133,7 +133,7 @@ class Physics:
         _check_model(model, tuple(n for n in readings if n not in overflow_reading(self.engine)))
         check_left_out(model, self.engine)
         if not isinstance(substeps, int | np.integer) or substeps < 1:
-            raise ValueError(f"substeps is {substeps!r}: a control step has 1, 2, 3 or more.")
+            raise ValueError(f"substeps is {substeps!r}: a control step needs 1, 2, 3 or more.")
         self.model, self.substeps, self._built = model, substeps, numbers(model, CHANGEABLE_FIELDS)
         self.control_timestep = substeps * float(model.opt.timestep)
         record: Any = collections.namedtuple("Readings", list(readings))  # type: ignore[misc]

@@ -1,7 +1,6 @@
 """What an engine leaves out of a model without a word: it is refused, or the motion is another."""
 
 import operator
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,16 +17,8 @@ LEFT_OUT: dict[str, dict[str, int]] = {
     "jax": dict.fromkeys(_JAX.split(), 0) | dict.fromkeys(_PLUGINS, -1) | {"actuator_ctrlnum": 1},
     "warp": {"opt.disableactuator": 0, "actuator_armature": 0},
 }
-# Values that an engine's code takes, and then does nothing with.
-LEFT_OUT_VALUES: dict[str, dict[str, Any]] = {
-    "c": {},
-    "jax": {
-        "opt.integrator": mujoco.mjtIntegrator.mjINT_DISCRETE,
-        "sensor_type": mujoco.mjtSensor.mjSENS_TACTILE,
-    },
-    "warp": {"actuator_gaintype": mujoco.mjtGain.mjGAIN_USER},
-}
-_UNSEEN = [int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("CYLINDER", "HFIELD", "SDF")]
+_GEOM = mujoco.mjtGeom
+_UNSEEN = (_GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_SDF)  # by MJX's rays
 
 
 def check_left_out(model: mujoco.MjModel, engine: str) -> None:
@@ -36,8 +27,6 @@ def check_left_out(model: mujoco.MjModel, engine: str) -> None:
     for name, idle in LEFT_OUT[engine].items():
         values = np.ravel(operator.attrgetter(name)(model))
         found += [f"{name} = {x}" for x in values[values != idle]]
-    for name, value in LEFT_OUT_VALUES[engine].items():
-        found += [value.name] * bool(np.isin(int(value), operator.attrgetter(name)(model)))
     if found:
         raise ValueError(
             f"The model has {found[0]}, which engine {engine!r} does not have and leaves out "
@@ -47,22 +36,28 @@ def check_left_out(model: mujoco.MjModel, engine: str) -> None:
 
 def _combinations(model: mujoco.MjModel) -> dict[str, dict[str, bool]]:
     """Returns what each engine leaves out that is in no field alone, and whether it is there."""
+    opt, bit = model.opt, mujoco.mjtDisableBit
+    euler, rk4, discrete = (
+        opt.integrator == getattr(mujoco.mjtIntegrator, f"mjINT_{x}")
+        for x in ("EULER", "RK4", "DISCRETE")
+    )
+    bits = (bit.mjDSBL_SPRING, bit.mjDSBL_DAMPER, bit.mjDSBL_EULERDAMP)
+    springs, dampers, explicit = (bool(opt.disableflags & int(one)) for one in bits)
     rays = model.sensor_type == mujoco.mjtSensor.mjSENS_RANGEFINDER
     plain = (model.sensor_objtype == mujoco.mjtObj.mjOBJ_SITE) & (model.sensor_intprm[:, 0] == 1)
-    either = {"a rangefinder on a camera, or with other data than dist": (rays & ~plain).any()}
-    opt, bit = model.opt, mujoco.mjtDisableBit
-    springs, dampers, explicit = (
-        bool(opt.disableflags & one)
-        for one in (bit.mjDSBL_SPRING, bit.mjDSBL_DAMPER, bit.mjDSBL_EULERDAMP)
-    )
-    implicit = opt.integrator == mujoco.mjtIntegrator.mjINT_EULER and not explicit
+    unseen = np.isin(model.geom_type, [int(x) for x in _UNSEEN])
+    damped = model.dof_damping.any()
     late = model.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC
-    rk4 = opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-    mjx = {
-        "a rangefinder, and a cylinder or height field": rays.any()
-        and np.isin(model.geom_type, _UNSEEN).any(),
+    either = {"a rangefinder on a camera, or with other data than dist": (rays & ~plain).any()}
+    jax = {
+        "a rangefinder, and a cylinder or height field": rays.any() and unseen.any(),
+        "a tactile sensor": (model.sensor_type == mujoco.mjtSensor.mjSENS_TACTILE).any(),
+        "the integrator discrete": discrete,
         "only one of springs and dampers disabled": springs != dampers,
-        "dampers disabled, and eulerdamp not": dampers and implicit and model.dof_damping.any(),
+        "dampers disabled, and eulerdamp not": damped and dampers and euler and not explicit,
     }
-    of_warp = {"sensors of accelerations under RK4, at its first stage": rk4 and late.any()}
-    return {"c": {}, "jax": either | mjx, "warp": either | of_warp}
+    warp = {
+        "sensors of accelerations under RK4, at its first stage": rk4 and late.any(),
+        'gaintype="user"': (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_USER).any(),
+    }
+    return {"c": {}, "jax": either | jax, "warp": either | warp}

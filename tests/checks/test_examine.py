@@ -1,6 +1,7 @@
 """`python -m purerl.check`: a broken environment or network for each check, which finds just it."""
 
 import dataclasses
+import re
 from types import SimpleNamespace
 
 import flax.linen as nn
@@ -10,7 +11,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from purerl.checks import examine_env, examine_network
+from purerl.checks import check_env, examine_env, examine_network
+from purerl.checks.examine_model import check_model, check_ranges
 from purerl.checks.watch_physics import check_controls, check_placed
 from purerl.core.records import Network, Normal, PolicyOutput
 from purerl.devices import memory
@@ -275,6 +277,65 @@ def test_a_goal_that_is_placed_late(late):
     said = bad(check_placed(pushed(late=late)))
     assert bool(said) == late
     assert not late or 'by init\'s changes={"body_pos": ...}' in said["placing"]
+
+
+BALL = """<mujoco><compiler angle="{angle}"/><worldbody><geom type="plane" size="1 1 .1"/>
+<body pos="0 0 .1"><freejoint/><geom size=".1"/></body>
+<body pos="0 0 1"><joint name="arm" range="{range}"/><geom type="capsule" size=".1 .5"/></body>
+</worldbody><actuator><motor name="push" joint="arm" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Balls(Toy):
+    """A ball on the floor, and an arm."""
+
+    physics: Physics
+    turned: bool = True
+    action_size = 1
+
+    def reset(self, key):
+        start = jnp.asarray(self.physics.model.qpos0) * (1.0 if self.turned else 0.0)
+        physics, _ = self.physics.init(start, jax.random.normal(key, (7,)))
+        return toy_state(physics.qpos[:2]).replace(physics=physics)
+
+    def step(self, state, action):
+        physics, _ = self.physics.step(state.physics, action)
+        return toy_state(physics.qpos[:2]).replace(physics=physics)
+
+
+def balls(angle="radian", range="-1 1", iterations=100, **how):  # noqa: A002
+    model = mujoco.MjModel.from_xml_string(BALL.format(angle=angle, range=range))
+    model.opt.solver, model.opt.iterations = mujoco.mjtSolver.mjSOL_CG, iterations
+    return Balls(physics=Physics(model, (), 5, "c"), **how)
+
+
+@pytest.mark.parametrize(("iterations", "found"), [(100, False), (1, True)])
+def test_a_solver_that_does_not_converge(iterations, found):
+    env = balls(iterations=iterations)
+    said = list(check_model(env, check_env.try_out(env, 4, 5)))
+    assert [one.about for one in said] == ["solver"]
+    assert (said[0].level == "warning") == found
+    assert f"by {iterations} iterations (50 of line search)" in said[0].text
+
+
+@pytest.mark.parametrize(
+    ("angle", "limits", "said"),
+    [
+        ("degree", "-2.6 2.6", "joint arm turns by 0.0454 rad at most.* written in radians"),
+        ("radian", "-150 10", "joint arm turns by 150 rad at most.* written in degrees"),
+        ("degree", "-150 10", ""),
+        ("radian", "-2.6 2.6", ""),
+    ],
+)
+def test_ranges_of_the_other_unit(angle, limits, said):
+    found = bad(check_ranges(balls(angle, limits).physics.model))
+    assert bool(found) == bool(said)
+    assert not said or re.search(said, found["ranges"])
+
+
+@pytest.mark.parametrize("turned", [True, False])
+def test_a_start_without_a_rotation(turned):
+    assert bool(bad(check_placed(balls(turned=turned)))) == (not turned)
 
 
 # --- networks ---
