@@ -119,6 +119,9 @@ def test_a_model_changed_afterwards_changes_no_engine():
     physics = Physics(model, (), 2, "c")
     want = reference(model, 2)
     model.dof_damping[:] = 5.0
+    with pytest.raises(ValueError, match="dof_damping was edited after"):
+        swing(physics)
+    physics.model = pendulum(mass=3.0)  # as it was: the engine has a copy of that
     assert swing(physics) == pytest.approx(want, abs=1e-6)
     assert swing(Physics(model, (), 2, "c")) == pytest.approx(reference(model, 2), abs=1e-6)
 
