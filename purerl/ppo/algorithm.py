@@ -133,7 +133,8 @@ def collect(
     Returns:
       `state` with its environments moved on, and what was seen, as one part [1, ...].
     """
-    memory = state.memory  # before the rollout, for the learner unrolls the network from there
+    # Kept from before the rollout: the learner unrolls the network from there.
+    memory = state.memory
     state, transitions, sums = rollout(config, env, network, state)
     valid, seen = transitions.valid, transitions.observation
     experience = Experience(
@@ -169,9 +170,9 @@ def improve(
     seen = experience.observations, experience.returns, experience.sums
     observations, returns, sums = parts.gather(seen)
     # The statistics of returns have this rollout before its rewards are divided. Else they would be
-    # of nothing in the first update, and targets as large as rewards come spoil a value function for
-    # long: a point with a bonus of 1 for being alive had lost 100 after ten updates, on four seeds,
-    # where it gains 43 of 50 now (tests/ppo/test_probes.py).
+    # of nothing in the first update, and targets as large as rewards come spoil a value function
+    # for long. A point with a bonus of 1 for being alive (tests/ppo/test_probes.py) had lost 100
+    # after ten updates, on four seeds, where it gains 43 of 50 now.
     state = state.replace(reward_normalizer=merge(state.reward_normalizer, pool(returns)))
     batch = parts.map(functools.partial(make_batch, config, state), experience.transitions)
     part_ids = experience.env_ids[:, 0]  # no environment is in two parts, so its id names the part
