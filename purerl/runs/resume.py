@@ -158,7 +158,9 @@ def cure(found: list[str]) -> str:
         return "Give the --num-seeds and --seed it was begun with"
     if any("purerl_experiment_" in line and "(absent)" in line for line in found):
         return "Give the command in the folder it was begun in"
-    if all(line.startswith(("source.", f"{CODE}: ")) for line in found):
+    if all(line.startswith("arrays") for line in found):
+        return "Put back the data, of a file or another run, that the environment or network holds"
+    if all(line.startswith(("source.", f"{CODE}: ", "arrays")) for line in found):
         return "Put back what was edited"
     if all(line.startswith("model: ") for line in found):  # no setting and no code has made it so
         return "Put back what was edited of the MuJoCo model, the MJCF or a file that it reads"
