@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import purerl
 from purerl.core.errors import UserError
@@ -28,9 +29,10 @@ def open_study(folder: Path | None) -> Any:
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     warnings.filterwarnings("ignore", category=UserWarning, module="optuna")
-    storage = f"sqlite:///{folder / FILE}" if folder else None
+    # A URI, in which no character of a name is syntax.
+    place = f"sqlite:///file:{quote(str((folder / FILE).absolute()))}?uri=true" if folder else None
     return optuna.create_study(
-        study_name="sweep", storage=storage, direction="maximize", load_if_exists=True
+        study_name="sweep", storage=place, direction="maximize", load_if_exists=True
     )
 
 
