@@ -140,7 +140,7 @@ def notes(summaries: Sequence[dict[str, Any]]) -> list[str]:
     left_out = sum(s["unfinished"] for s in summaries)
     silent = sum(s["done"] + s["failed"] - s["n"] for s in summaries)
     found = {
-        f"No IQM (-) below {LEAST_IQM} seeds: differences and curves are of the mean there.": any(
+        f"Below {LEAST_IQM} seeds there is no IQM: scores, differences and curves are of the mean.": any(
             0 < s["n"] < LEAST_IQM for s in summaries
         ),
         f"No interval (-) below {LEAST_RUNS} seeds of a configuration, where it would be too "

@@ -199,7 +199,7 @@ def test_a_statistic_has_its_name_from_the_number_of_seeds_on_at_which_it_is_one
     (group,) = found(tmp_path, tmp_path / "runs")["groups"]
     assert (group["iqm"], group["score"]) == (iqm, np.mean(range(1, n + 1)))
     assert group["tenth"] == (tenth and pytest.approx(tenth))
-    assert ("No IQM (-) below 4 seeds" in capsys.readouterr().out) == (iqm is None)
+    assert ("Below 4 seeds there is no IQM" in capsys.readouterr().out) == (iqm is None)
 
 
 # --- code ---

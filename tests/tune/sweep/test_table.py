@@ -16,7 +16,7 @@ from tests.training.test_run import TOY
 def row(number: int, score, status: str = "done", **values) -> Row:
     texts = {name: str(value) for name, value in values.items()}
     runs = {} if score is None else {"seed1": score}
-    summary = {"iqm": score, "n": len(runs), "runs": runs, "interval": None, "mean": score}
+    summary = {"score": score, "iqm": None, "n": len(runs), "runs": runs, "interval": None, "mean": score}
     summary |= {"worst": score, "done": len(runs), "failed": 0, "unfinished": 0}
     return Row(Point(number, texts), values, status, "", summary)
 
