@@ -139,10 +139,9 @@ def notes(summaries: Sequence[dict[str, Any]]) -> list[str]:
     """Returns what a reader of the tables must know."""
     left_out = sum(s["unfinished"] for s in summaries)
     silent = sum(s["done"] + s["failed"] - s["n"] for s in summaries)
+    few = any(0 < s["n"] < LEAST_IQM for s in summaries)
     found = {
-        f"Below {LEAST_IQM} seeds there is no IQM: scores, differences and curves are of the mean.": any(
-            0 < s["n"] < LEAST_IQM for s in summaries
-        ),
+        f"Below {LEAST_IQM} seeds there is no IQM: what is compared and drawn is the mean.": few,
         f"No interval (-) below {LEAST_RUNS} seeds of a configuration, where it would be too "
         "narrow. Ten seeds are a good number.": any(s["interval"] is None for s in summaries),
         "Failed runs (non-finite numbers) count with the last value they reached.": any(

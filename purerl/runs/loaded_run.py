@@ -182,7 +182,7 @@ class Run:
         if episodes < 1:
             raise UserError(f"episodes is {episodes}; it must be at least 1.")
         config, env, network, engine = self.restored.setup
-        here = Path.cwd()
+        place, here = self.folder, Path.cwd()
 
         def judge(state: Any, key: Any) -> dict[str, Any]:
             length = config.episode_length
@@ -196,9 +196,7 @@ class Run:
         key = derive(jax.random.key(seed), Purpose.EVALUATION)
         found = jax.device_get(jax.jit(judge)(self.state, key))
         return {
-            "run": str(
-                self.folder.relative_to(here) if here in self.folder.parents else self.folder
-            ),
+            "run": str(place.relative_to(here) if here in place.parents else place),
             "update": self.update,
             "steps": self.steps,
             "digest": self.digest,

@@ -9,8 +9,9 @@ import types
 import pytest
 
 from purerl import run
-from purerl.core.errors import SUCCESS
+from purerl.core.errors import SUCCESS, USAGE
 from purerl.runs import checkpoint_folder
+from purerl.training import session
 from tests.experiment.test_source_hashes import TOY
 
 WORDS = [str(TOY), "--evaluation.number", "6", "--checkpoints", "2", "--wandb", "offline"]
@@ -82,3 +83,13 @@ def test_the_best_evaluation_has_a_checkpoint(trained):
     assert len(scores) == 6
     (found,) = checkpoint_folder.best_by_stage(folder / "checkpoints").values()
     assert found[0] == max(scores.values()) and scores[found[1]] == found[0]
+
+
+def test_a_run_does_not_go_on_with_other_data(trained, monkeypatch, capsys):
+    """As if a file that its environment reads had been edited."""
+    held = json.loads((trained[0] / "manifest.json").read_text())["arrays"]
+    monkeypatch.setattr(session, "hash_held", lambda *of: held | {"float32[3, 4]": "another"})
+    place = str(trained[0].parent.parent)
+    assert run.main([*WORDS[:-2], "--runs", place, "--resume"]) == USAGE
+    said = capsys.readouterr().err
+    assert "arrays.float32[3, 4]: (absent) -> another" in said and "Put back the data" in said

@@ -343,3 +343,14 @@ def test_a_sweep_that_was_killed_ends_as_one_left_in_peace(tmp_path, monkeypatch
         lines = [read_lines(Path("sweeps") / name, point) for name in ("peace", "killed")]
         assert lines[0] == lines[1] and list(map(len, lines[0])) == [150, 150]
     assert rows("killed") == rows("peace")
+
+
+@has("optuna")
+def test_a_study_is_in_its_own_folder_whatever_its_name(place):
+    from purerl.tune.sweep import study
+
+    for name in ("a?1", "a?2", "b%20#c [1]"):
+        folder = place / name
+        folder.mkdir()
+        study.open_study(folder).ask()
+        assert (folder / study.FILE).is_file() and len(study.open_study(folder).trials) == 1
