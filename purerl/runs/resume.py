@@ -20,7 +20,7 @@ from purerl.runs.folder import CODE, CONFIG, OURS, Folder, allowed_changes, chec
 
 EDITED = "fingerprint: config.json, manifest.json or experiment.py is not what the run wrote"
 # What a line of a change begins with that may change the reward, or how it is discounted.
-OF_REWARD = ("settings.env.", "settings.ppo.gamma:", "source.", f"{CODE}:", "model:")
+OF_REWARD = ("settings.env.", "settings.ppo.gamma:", "source.", f"{CODE}:", "model:", "arrays")
 MANY = 9  # edited files, which a refusal to resume then counts and does not list
 
 
