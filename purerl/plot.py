@@ -31,7 +31,7 @@ class PlotOptions:
 def command(options: PlotOptions) -> None:
     """Prints the curve, and writes the picture that was asked for."""
     from purerl.report import comparison
-    from purerl.report.run_reader import find_runs, read
+    from purerl.report.run_reader import read_runs
     from purerl.report.seed_statistics import every_curve, make_groups
     from purerl.report.terminal_plot import check_plotted, draw
 
@@ -39,7 +39,7 @@ def command(options: PlotOptions) -> None:
         raise UserError("Give the runs to plot: python -m purerl.plot RUN RUN ...")
     if options.out is not None and options.out.suffix != ".png":
         raise UserError(f"out is {options.out}; it must end in .png.")
-    runs = [read(path) for path in find_runs(options.runs)]
+    runs = read_runs(options.runs)
     groups = make_groups(runs, ())
     check_plotted(runs, options.metric)
     curves = [every_curve(group, options.metric) for group in groups]

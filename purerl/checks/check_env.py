@@ -14,7 +14,9 @@ from purerl.core.errors import UserError
 from purerl.core.records import Array, PyTree, is_key
 from purerl.machine.state_arrays import flatten
 
-RESERVED = {"episode_return", "episode_length", "lost"}  # what an evaluation measures itself
+# What an evaluation measures itself, and adds of the return.
+RESERVED = {"episode_return", "episode_length", "lost"}
+RESERVED |= {f"episode_return_{name}" for name in ("std", "min", "max")}
 
 
 def check_env(env: Env, num_envs: int = 16, num_steps: int = 4) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.extend import core
 
 CUSTOM_DERIVATIVES = ("custom_jvp_call", "custom_vjp_call")
@@ -30,6 +31,16 @@ def equations(closed: core.ClosedJaxpr) -> Iterator[core.JaxprEqn]:
         yield eqn
         for sub in sub_jaxprs(eqn):
             yield from equations(sub)
+
+
+def constants(closed: core.ClosedJaxpr) -> Iterator[Any]:
+    """Yields the arrays and numbers that a trace holds, at any depth, some more than once."""
+    yield from closed.consts
+    for atom in (*(v for eqn in closed.jaxpr.eqns for v in eqn.invars), *closed.jaxpr.outvars):
+        if isinstance(atom, core.Literal):
+            yield np.asarray(atom.val, atom.aval.dtype)
+    for sub in (sub for eqn in closed.jaxpr.eqns for sub in sub_jaxprs(eqn)):
+        yield from constants(sub)
 
 
 def has_loop(closed: core.ClosedJaxpr) -> bool:

@@ -15,6 +15,7 @@ from purerl.core.errors import UserError, one_line, unknown_name
 from purerl.experiment.definition import Experiment
 from purerl.experiment.kinds import suggest_field, wrong_value
 from purerl.experiment.settings_json import has_settings, to_json
+from purerl.experiment.source_hashes import forget_edited, imported_files
 from purerl.machine.files import read_bytes
 from purerl.ppo.config import Config, Evaluation
 
@@ -132,7 +133,9 @@ def load_file(
             "that has to work alone: import by the full name."
         )
     with _mistakes(str(path), place, of_run):
+        forget_edited(module_name)
         exec(compile(text, str(path), "exec", dont_inherit=True), module.__dict__)
+        imported_files([module_name])  # what it has imported is what it is hashed by
     if not isinstance(found := getattr(module, "experiment", None), Experiment):
         raise UserError(f"{path} defines no `experiment = Experiment(...)` (it is {found!r}).")
     for field in ("env", "network", "ppo", "evaluation"):

@@ -68,7 +68,8 @@ class RunOptions:
     log_every: int = 0
     """Updates between two lines of metrics.jsonl; 0: chosen for about 500 lines."""
     checkpoints: int = 10
-    """Checkpoints over the run, evenly spaced, the last one at the end."""
+    """Checkpoints over the run, evenly spaced, the last one at the end. Each evaluation that is the
+    best so far has one too."""
     keep: int = 3
     """Newest checkpoints to keep, besides the best one by evaluation."""
     tensorboard: bool = False

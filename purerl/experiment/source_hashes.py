@@ -12,8 +12,12 @@ import importlib.util
 import os
 import sys
 import sysconfig
+import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
+
+from purerl.core.errors import UserError
 
 PACKAGE = Path(__file__).parent.parent
 # Rooms, and modules of other rooms, that no program is traced from. They prepare a run, look after
@@ -29,10 +33,16 @@ LEFT_OUT |= {
 
 # Environments and experiments count where they are imported, as a person's own do.
 IMPORTED = {"envs", "experiments", "assets"}
+_seen: dict[Path, tuple[Any, bytes]] = {}  # file -> its module's spec, and the text of both
+# When this process began, by Linux [s since 1970].
+_TICKS = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
+_BEGIN = time.time() - time.clock_gettime(time.CLOCK_BOOTTIME) + _TICKS / os.sysconf("SC_CLK_TCK")
 
 
 def source_hashes(builders: Iterable[Callable], package: Path = PACKAGE) -> dict[str, str]:
     """Returns a short sha256 of each source file that may decide a run's bits, by module.
+
+    It is of the text that this process imported, whatever the file holds now.
 
     The rule: every module in a room of this package counts, but for those in LEFT_OUT; the commands
     do not. So does every Python file that the builders import, installed packages excepted, with
@@ -45,7 +55,7 @@ def source_hashes(builders: Iterable[Callable], package: Path = PACKAGE) -> dict
     files = package_files(package) | imported_files(map(module_of, builders))
     folders = {file.parent.parent / "assets" for file in files.values()}
     bodies = {f"assets/{f.name}": f for folder in folders for f in folder.rglob("*.xml")}
-    found = {name: hash_code(file.read_bytes()) for name, file in files.items()}
+    found = {name: hash_code(text_of(name, file)) for name, file in files.items()}
     found |= {name: hashlib.sha256(f.read_bytes()).hexdigest() for name, f in bodies.items()}
     # By name, not by place: a moved checkout is the same source.
     return {name: value[:16] for name, value in sorted(found.items())}
@@ -182,11 +192,57 @@ def module_file(name: str) -> Path | None:
     return next((file for file in files if file.is_file()), None)
 
 
+def text_of(name: str, file: Path) -> bytes:
+    """Returns a module's source as this process imported it, as far as it has looked before."""
+    spec = getattr(sys.modules.get(name), "__spec__", None)
+    if getattr(spec, "origin", None) != str(file):  # not imported, or another file of that name
+        return file.read_bytes()
+    if file not in _seen or _seen[file][0] is not spec:  # a reloaded module has a new one
+        _seen[file] = spec, file.read_bytes()
+    return _seen[file][1]
+
+
+def forget_edited(module: str) -> None:
+    """Makes Python import anew what `module` imports, all of it, if some of it was edited.
+
+    Raises:
+      UserError: it is of this package, which is running.
+    """
+    known, ours = dict(_seen), package_files(PACKAGE)
+    own = {k: x for k, x in imported_files([module]).items() if k != module}
+    stale = [name for name, file in (ours | own).items() if _is_stale(name, file, known)]
+    for name in stale:
+        if name.startswith(f"{PACKAGE.name}."):
+            raise UserError(
+                f"{name} has been edited since this process imported it, so what would run is not "
+                "what is there: begin a new process (in a notebook, restart the kernel)."
+            )
+    for file in own.values() if stale else ():
+        # Python would take compiled code for that of an edit within the same second.
+        Path(importlib.util.cache_from_source(str(file))).unlink(missing_ok=True)
+    packages = set(map(_package, own if stale else ()))
+    for name in [k for k in sys.modules if k != module and _package(k) in packages]:
+        del sys.modules[name]
+
+
+def _is_stale(name: str, file: Path, known: dict[Path, tuple[Any, bytes]]) -> bool:
+    """Tells whether a module's file does something else by now than what was imported."""
+    if file in known:
+        then, now = known[file][1], file.read_bytes() if file.exists() else b""
+        return then != now and hash_code(then) != hash_code(now)
+    # Who imported it before may have edited it since.
+    return (
+        name in sys.modules
+        and name.partition(".")[0] != PACKAGE.name
+        and file.stat().st_mtime > _BEGIN
+    )
+
+
 def _imports(module: str, file: Path) -> list[str]:
     """Returns every name that a module's import statements may mean as a module."""
     package = module if file.name == "__init__.py" else module.rpartition(".")[0]
     names: list[str] = []
-    for node in ast.walk(ast.parse(file.read_bytes())):
+    for node in ast.walk(ast.parse(text_of(module, file), str(file))):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):

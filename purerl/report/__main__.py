@@ -33,13 +33,13 @@ def command(options: ReportOptions) -> None:
     """Writes the page, and prints where it is."""
     from purerl.machine.files import write_answer
     from purerl.report.page import make_page
-    from purerl.report.run_reader import find_runs, read
+    from purerl.report.run_reader import read_runs
 
     if not options.runs:
         raise UserError("Give the runs to report: python -m purerl.report RUN RUN ...")
     if options.out.is_dir():
         raise UserError(f"{options.out} is a folder: give a file, as --out {options.out}/a.html.")
-    runs = [read(path) for path in find_runs(options.runs)]
+    runs = read_runs(options.runs)
     page = make_page(runs, options.group_by).encode()
     write_answer(options.out, page)
     number = f"{len(runs)} run{'s' * (len(runs) > 1)}"

@@ -10,7 +10,7 @@ from purerl.core.errors import UserError
 from purerl.machine.files import write_json, writing
 from purerl.machine.output import printable
 from purerl.report import bit_diff, run_reader, seed_statistics
-from purerl.report.bootstrap import LEAST_RUNS
+from purerl.report.bootstrap import LEAST_IQM, LEAST_RUNS, center_name
 from purerl.report.seed_statistics import Curve
 from purerl.runs import manifest
 
@@ -20,10 +20,10 @@ GROUPS = [
     ("10th pct", "tenth"), ("worst", "worst"), ("in", "worst_run"), ("failed", "failed"),
 ]  # fmt: skip
 VERSUS = [
-    ("group", "label"), ("IQM difference", "difference"), ("95% interval", "difference_interval"),
+    ("group", "label"), ("difference", "difference"), ("95% interval", "difference_interval"),
     ("P(better)", "improvement"), ("95% interval", "improvement_interval"),
     ("pairs", "same_seeds"),
-    ("paired IQM", "paired_difference"), ("95% interval", "paired_interval"),
+    ("paired", "paired_difference"), ("95% interval", "paired_interval"),
 ]  # fmt: skip
 GROUPS_CSV = ["label", "n", "done", "failed", "unfinished", "iqm", "mean", "tenth", "worst"]
 GROUPS_CSV += ["worst_run", "low", "high"]
@@ -48,7 +48,7 @@ def compare(
     Raises:
       UserError: a place means no run, or there is no such metric or setting.
     """
-    runs = [run_reader.read(path) for path in run_reader.find_runs(places)]
+    runs = run_reader.read_runs(places)
     result, curves = compare_records(runs, metric, group_by)
     if result["unscored"] and not result["pairs"]:  # else the bits can be compared all the same
         raise UserError(result["unscored"])
@@ -60,7 +60,8 @@ def compare_records(
 ) -> tuple[dict[str, Any], list[Curve]]:
     """Compares runs that were read, as `compare`; "unscored" says why there are no scores."""
     first: dict[str, run_reader.RunRecord] = {}
-    repeats = [(first.setdefault(run.identity, run), run) for run in runs]
+    any_code = [run._replace(settings=run.settings | {"code": ""}).identity for run in runs]
+    repeats = [(first.setdefault(name, run), run) for name, run in zip(any_code, runs, strict=True)]
     pairs = [bit_diff.compare_bits(a, b) for a, b in repeats if a is not b]
     groups = seed_statistics.make_groups(runs, group_by)
     unscored = ""
@@ -119,7 +120,7 @@ def describe(result: dict[str, Any]) -> list[str]:
     if result["metric"] != "eval/episode_return":
         lines.append("More counts as better: 'worst' and '10th pct' are the low end.")
     if result["pairs"]:
-        lines.append("Runs of one configuration and seed count once, as the first of them.")
+        lines.append("Runs of one configuration, code and seed count once, as the first of them.")
     return lines + notes(groups)
 
 
@@ -138,7 +139,9 @@ def notes(summaries: Sequence[dict[str, Any]]) -> list[str]:
     """Returns what a reader of the tables must know."""
     left_out = sum(s["unfinished"] for s in summaries)
     silent = sum(s["done"] + s["failed"] - s["n"] for s in summaries)
+    few = any(0 < s["n"] < LEAST_IQM for s in summaries)
     found = {
+        f"Below {LEAST_IQM} seeds there is no IQM: what is compared and drawn is the mean.": few,
         f"No interval (-) below {LEAST_RUNS} seeds of a configuration, where it would be too "
         "narrow. Ten seeds are a good number.": any(s["interval"] is None for s in summaries),
         "Failed runs (non-finite numbers) count with the last value they reached.": any(
@@ -254,10 +257,14 @@ def draw_curves(path: Path, curves: Sequence[Curve], metric: str) -> None:
 
 
 def curves_title(curves: Iterable[Curve]) -> str:
-    """Returns the title of a picture of curves: it names intervals only where some are drawn."""
+    """Returns the title of a picture of curves: it names what is drawn, and nothing else."""
+    curves = list(curves)
     with_band = [curve.band.low is not None for curve in curves]
+    names = {center_name(len(curve.runs)) for curve in curves}
+    center = "Mean" if names == {"mean"} else "Interquartile mean"
+    center += f" (below {LEAST_IQM} seeds the mean)" * (len(names) > 1)
     if all(with_band):
-        return "Interquartile mean, 95% intervals"
+        return f"{center}, 95% intervals"
     if any(with_band):
-        return f"Interquartile mean, 95% intervals where there are {LEAST_RUNS} seeds or more"
-    return f"Interquartile mean (no intervals below {LEAST_RUNS} seeds)"
+        return f"{center}, 95% intervals where there are {LEAST_RUNS} seeds or more"
+    return f"{center} (no intervals below {LEAST_RUNS} seeds)"

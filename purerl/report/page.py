@@ -144,8 +144,9 @@ def _unseen(runs: Sequence[RunRecord]) -> list[Html]:
 
 BANDS = (
     "Bands: around the evaluation of one run, one standard deviation over its episodes; around a "
-    "heavy line (the interquartile mean of a group), the 95% interval over five seeds or more; in "
-    "training, the least and largest value where neighbouring points are drawn as one."
+    "heavy line (the interquartile mean of a group, below four seeds the mean), the 95% interval "
+    "over five seeds or more; in training, the least and largest value where neighbouring points "
+    "are drawn as one."
 )
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+from purerl.report.bootstrap import center_name
 from purerl.report.run_reader import RunRecord
 from purerl.report.seed_statistics import Group, learning_curve
 
@@ -108,7 +109,7 @@ def _group_series(group: Group, metric: str, g: int) -> list[Series]:
     if any(visible(run) != run for run in curve.runs):
         return []
     iqm, low, high = (None if a is None else [float(v) for v in a] for a in curve.band)
-    label = f"IQM of {len(curve.runs)}"
+    label = f"{center_name(len(curve.runs))} of {len(curve.runs)}"
     return [Series(label, g, None, curve.steps, iqm or [], low, high)]
 
 

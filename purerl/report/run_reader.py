@@ -1,7 +1,10 @@
 """Reads runs back from their folders: settings, metrics, and how far each run came."""
 
 import glob
+import hashlib
+import os
 import sys
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,6 +35,12 @@ class RunRecord(NamedTuple):
         return repr((self.seed, sorted(self.settings.items(), key=str)))
 
     @property
+    def code(self) -> str:
+        """A short hash of the code, the model and the data, whatever their files are called."""
+        parts = flatten({name: self.manifest.get(name) for name in ("source", "model", "arrays")})
+        return hashlib.sha256(repr(sorted(map(str, parts.values()))).encode()).hexdigest()[:8]
+
+    @property
     def status(self) -> str:
         """Tells how the run ended: "done", "failed" or "unfinished".
 
@@ -53,15 +62,28 @@ class RunRecord(NamedTuple):
         return {n: float(v) for n, v in found.items() if v is not None and abs(v) <= most}
 
 
+def read_runs(arguments: Iterable[Path]) -> list[RunRecord]:
+    """Reads the runs that arguments mean, as `find_runs`.
+
+    Where runs agree in all settings and not in their code, the code is one more setting of them.
+    """
+    runs = [read(path) for path in find_runs(arguments)]
+    codes = Counter(settings for settings, _ in {(repr(run.settings), run.code) for run in runs})
+    several = [codes[repr(run.settings)] > 1 for run in runs]
+    more = ({"code": run.code} if apart else {} for run, apart in zip(runs, several, strict=True))
+    return [run._replace(settings=run.settings | x) for run, x in zip(runs, more, strict=True)]
+
+
 def find_runs(arguments: Iterable[Path]) -> list[Path]:
     """Returns the runs' folders that the arguments mean, in order, each once.
 
-    An argument is a run, a folder of runs (`runs/ant_run`, `runs`) or a pattern of these
-    (`'runs/ant_run/a*'`). UserError if one means no run.
+    An argument is a run, a folder of runs (`runs/ant_run`, `runs`) or, if nothing has that name, a
+    pattern of these (`'runs/ant_run/a*'`). UserError if one means no run.
     """
     found: list[Path] = []
     for argument in arguments:
-        places = sorted(map(Path, glob.glob(str(argument)))) or [argument]
+        matches = [] if os.path.exists(argument) else sorted(map(Path, glob.glob(str(argument))))
+        places = matches or [argument]
         runs = [run for place in places for run in runs_in(place)]
         if not runs:
             kind = "holds no run" if argument.is_dir() else "is no run, folder of runs or pattern"

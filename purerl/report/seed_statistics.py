@@ -9,6 +9,8 @@ from purerl.core.errors import UserError, unknown_name
 from purerl.report import bootstrap
 from purerl.report.run_reader import RunRecord
 
+LEAST_TENTH = 10  # runs that have a 10th percentile
+
 
 class Group(NamedTuple):
     """Runs that differ in nothing but their seed, or in settings that the grouping ignores."""
@@ -121,12 +123,14 @@ def summarize(group: Group, metric: str) -> dict[str, Any]:
         done=status.count("done"),
         failed=status.count("failed"),  # they count with the last value that they reached
         unfinished=status.count("unfinished"),  # they do not count
-        iqm=float(bootstrap.pooled_iqm(strata)) if each else None,
+        iqm=float(bootstrap.pooled_iqm(strata)) if len(each) >= bootstrap.LEAST_IQM else None,
+        score=float(bootstrap.pooled_iqm(strata)) if each else None,  # of fewer runs: their mean
         interval=bootstrap.iqm_interval(strata) if each else None,
         mean=float(values.mean()) if each else None,
         worst=float(values.min()) if each else None,
         worst_run=min(each, key=lambda path: each[path]) if each else "",
-        tenth=float(np.percentile(values, 10)) if each else None,  # percentile
+        # Percentile; that of fewer is made up of the two lowest.
+        tenth=float(np.percentile(values, 10)) if len(each) >= LEAST_TENTH else None,
         runs=each,
     )
 

@@ -91,5 +91,5 @@ def log_to_wandb(folder: Path, mode: str, project: str, video: Path, update: int
         VIDEO: wandb.Video(str(video), format="mp4"),
         SHEET: wandb.Image(str(video.with_suffix(".png"))),
     }
-    sink.log(shown | {"update": update})
+    sink.run.log(shown | {"update": update}, step=max(update, sink.run.step))
     sink.close()

@@ -8,6 +8,7 @@ may be whole, so nothing is called damaged but what was read and has another has
 import contextlib
 import hashlib
 import json
+import math
 import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -129,14 +130,21 @@ def common_updates(folders: Iterable[Path]) -> list[int]:
     return sorted(set.intersection(*(set(updates(folder)) for folder in folders)))
 
 
-def best_update(folder: Path) -> int | None:
-    """Returns the update of the checkpoint with the highest evaluation return, None without any."""
-    scored = []
+def best_by_stage(folder: Path) -> dict[str | None, tuple[float, int]]:
+    """Returns the highest evaluation return of each stage and its update; the last stage is last.
+
+    A stage begins where --allow-changes let something pass: the return may be another measure then.
+    It is named by the fingerprint. Where none of its checkpoints was evaluated, the return is -inf.
+    """
+    found: dict[str | None, tuple[float, int]] = {}
     for update in updates(folder):
         with contextlib.suppress(DamagedError):
-            score = load_meta(path_of(folder, update)).get("eval_return")
-            scored += [(score, update)] if isinstance(score, float) else []
-    return max(scored)[1] if scored else None
+            meta = load_meta(path_of(folder, update))
+            run, score = meta.get("run"), meta.get("eval_return")
+            stage = str(run.get("fingerprint")) if isinstance(run, dict) else None
+            one = (score if isinstance(score, float) else -math.inf, update)
+            found[stage] = max(found.pop(stage, one), one)
+    return found
 
 
 def check_none_lost(folders: Sequence[Path], promised: bool) -> None:
@@ -160,7 +168,7 @@ def check_none_lost(folders: Sequence[Path], promised: bool) -> None:
 
 
 def retain(folder: Path, keep: int, together: Sequence[Path] = ()) -> None:
-    """Deletes old checkpoints, but never the best one by evaluation.
+    """Deletes old checkpoints, but never the best one of a stage by evaluation.
 
     Args:
       folder: a run's checkpoints.
@@ -169,7 +177,8 @@ def retain(folder: Path, keep: int, together: Sequence[Path] = ()) -> None:
         them have are counted.
     """
     newest = common_updates([folder, *together])[-keep:]
-    for update in {*updates(folder)} - {best_update(folder)}:
+    best = {update for score, update in best_by_stage(folder).values() if score > -math.inf}
+    for update in {*updates(folder)} - best:
         if newest and update < newest[0]:
             discard(path_of(folder, update))
 

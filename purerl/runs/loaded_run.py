@@ -1,14 +1,14 @@
 """A run read back from its folder: its policy, its metrics, its evaluation."""
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
 from purerl.core.errors import UserError
 from purerl.runs.folder import METRICS, check_is_run
-from purerl.runs.metrics_file import read_metrics
+from purerl.runs.metrics_file import deviation, read_metrics
 
 if TYPE_CHECKING:
     from purerl.core.env import Env
@@ -81,6 +81,15 @@ class Run:
     engine: str = ""  # "": the run's own
     trust: bool = False
 
+    def __post_init__(self) -> None:
+        """Keeps the folder's whole path: the process may change its own."""
+        object.__setattr__(self, "folder", Path(self.folder).absolute())
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles where the run is, and which checkpoint was read; not what was built of it."""
+        state = {field.name: getattr(self, field.name) for field in fields(self)}
+        return state | ({"checkpoint": str(self.update)} if "restored" in vars(self) else {})
+
     @functools.cached_property
     def restored(self) -> "restored_run.RestoredRun":
         """The experiment rebuilt, and the checkpoint."""
@@ -96,7 +105,7 @@ class Run:
         """The policy, at the start of an episode."""
         from purerl.runs.policy import Policy
 
-        return Policy(self.env, self.network, self.state)
+        return Policy(self.env, self.network, self.state, self)
 
     @property
     def experiment(self) -> "Experiment":
@@ -143,6 +152,7 @@ class Run:
 
         `pandas.DataFrame(run.metrics())` makes a table of them.
         """
+        check_is_run(self.folder)
         lines = read_metrics(self.folder / METRICS)
         names = dict.fromkeys(name for line in lines for name in line)
         return {name: [line.get(name) for line in lines] for name in names}
@@ -172,6 +182,7 @@ class Run:
         if episodes < 1:
             raise UserError(f"episodes is {episodes}; it must be at least 1.")
         config, env, network, engine = self.restored.setup
+        place, here = self.folder, Path.cwd()
 
         def judge(state: Any, key: Any) -> dict[str, Any]:
             length = config.episode_length
@@ -179,13 +190,13 @@ class Run:
 
         def summarize(values: Any) -> Figures:
             x = np.asarray(values, float)
-            mean, std, least, most = map(float, (x.mean(), x.std(), x.min(), x.max()))
+            mean, std, least, most = map(float, (x.mean(), deviation(x), x.min(), x.max()))
             return {"mean": mean, "std": std, "min": least, "max": most, "values": x.tolist()}
 
         key = derive(jax.random.key(seed), Purpose.EVALUATION)
         found = jax.device_get(jax.jit(judge)(self.state, key))
         return {
-            "run": str(self.folder),
+            "run": str(place.relative_to(here) if here in place.parents else place),
             "update": self.update,
             "steps": self.steps,
             "digest": self.digest,

@@ -15,6 +15,11 @@ LARGEST = 1 << 30  # [bytes]
 MAX_SKIPPED_IN_A_ROW = 10  # minibatches; a run that skips so many cannot go on
 
 
+def deviation(values: Any) -> float:
+    """Returns the standard deviation that a sample [n] tells of, over n - 1; 0 of one value."""
+    return float(values.std(ddof=min(1, len(values) - 1)))
+
+
 def read_metrics(path: Path) -> list[Record]:
     """Reads whole lines of metrics.jsonl: a run that is being written may end in half a line."""
     if not os.path.lexists(path):

@@ -1,6 +1,7 @@
 """What a run has learned, as a function from numpy to numpy."""
 
 import math
+import operator
 from typing import Any
 
 import jax
@@ -24,13 +25,14 @@ class Policy:
     (3, 1)
     """
 
-    def __init__(self, env: Env, network: Network, state: TrainState) -> None:
+    def __init__(self, env: Env, network: Network, state: TrainState, run: Any = None) -> None:
         """Prepares a policy at the start of an episode.
 
         Args:
           env: for the shapes of an observation.
           network: the network.
           state: for `params` and `normalizer`, and the shape of one environment's memory.
+          run: the `Run` that it is of; None: of none.
         """
 
         def act(state: TrainState, observation: PyTree, memory: PyTree, key: Any) -> Any:
@@ -42,8 +44,15 @@ class Policy:
             return distributions.to_action(raw), memory
 
         self._example = jax.eval_shape(env.reset, jax.random.key(0)).observation
-        self._state, self._act = state, jax.jit(act)
+        self._state, self._act, self._run = state, jax.jit(act), run
         self.reset()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickles as the run's folder and what is remembered: who unpickles it reads the run."""
+        if self._run is None:
+            raise UserError("A policy of no run cannot be pickled: pickle its parameters.")
+        remembered = {"_memory": self._memory, "_batch": self._batch}
+        return operator.attrgetter("policy"), (self._run,), remembered
 
     def reset(self) -> None:
         """Forgets: the next observation begins an episode."""

@@ -1,8 +1,10 @@
 """A run rebuilt from its folder alone, to see what its policy does."""
 
+import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from purerl.checks.held_arrays import hash_held
 from purerl.checks.user_code import own_line
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.records import TrainState
@@ -99,6 +101,9 @@ def _changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[
     found = [f"The code of {few}"] if edited else []
     if setup.engine == begun["engine"] and physics_hash(setup.env) != begun["model"]:
         found.append("MuJoCo's model")
+    held = begun.get("arrays")  # of older runs there is none
+    if not edited and held and held != hash_held(setup.env, setup.network):
+        found.append("The data that the environment or the network holds")
     return found
 
 
@@ -119,9 +124,12 @@ def _choose(run: Folder, update: str, abstract: TrainState, say: Say) -> checkpo
         if not whole:
             raise UserError(f"{run.path} has no whole checkpoint yet.")
         return whole[0]
-    number = checkpoint_folder.best_update(folder) if update == "best" else update
-    if number is None:
-        raise UserError(f"No checkpoint in {folder} was taken at an evaluation; try latest.")
+    number: int | str = update
+    if update == "best":
+        *_, (score, number) = [(-math.inf, 0), *checkpoint_folder.best_by_stage(folder).values()]
+        if score == -math.inf:
+            since = " since its last change" * bool(run.manifest.get("allowed_changes"))
+            raise UserError(f"No checkpoint in {folder} was evaluated{since}; try latest.")
     found = list(map(str, run.updates))
     if str(number) not in found:
         valid = ", ".join(["latest", "best", *found])

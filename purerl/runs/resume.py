@@ -20,7 +20,7 @@ from purerl.runs.folder import CODE, CONFIG, OURS, Folder, allowed_changes, chec
 
 EDITED = "fingerprint: config.json, manifest.json or experiment.py is not what the run wrote"
 # What a line of a change begins with that may change the reward, or how it is discounted.
-OF_REWARD = ("settings.env.", "settings.ppo.gamma:", "source.", f"{CODE}:", "model:")
+OF_REWARD = ("settings.env.", "settings.ppo.gamma:", "source.", f"{CODE}:", "model:", "arrays")
 MANY = 9  # edited files, which a refusal to resume then counts and does not list
 
 
@@ -158,7 +158,9 @@ def cure(found: list[str]) -> str:
         return "Give the --num-seeds and --seed it was begun with"
     if any("purerl_experiment_" in line and "(absent)" in line for line in found):
         return "Give the command in the folder it was begun in"
-    if all(line.startswith(("source.", f"{CODE}: ")) for line in found):
+    if all(line.startswith("arrays") for line in found):
+        return "Put back the data, of a file or another run, that the environment or network holds"
+    if all(line.startswith(("source.", f"{CODE}: ", "arrays")) for line in found):
         return "Put back what was edited"
     if all(line.startswith("model: ") for line in found):  # no setting and no code has made it so
         return "Put back what was edited of the MuJoCo model, the MJCF or a file that it reads"

@@ -7,7 +7,8 @@ import importlib.util
 import math
 import queue
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from purerl.core.errors import UserError, one_line
 from purerl.experiment.options import RunOptions
 from purerl.machine.output import Say
 from purerl.runs.folder import Folder
-from purerl.runs.metrics_file import Record
+from purerl.runs.metrics_file import Record, read_metrics
 
 
 class BackgroundLogger:
@@ -71,12 +72,12 @@ class BackgroundLogger:
 
 
 class _TensorBoardSink:
-    """Writes scalars for TensorBoard; what an earlier life wrote after `update` is hidden."""
+    """Writes scalars for TensorBoard; what earlier lives of the run wrote is hidden."""
 
-    def __init__(self, folder: Path, update: int) -> None:
+    def __init__(self, folder: Path) -> None:
         from tensorboardX import SummaryWriter
 
-        self.writer = SummaryWriter(str(folder / "tensorboard"), purge_step=update + 1)
+        self.writer = SummaryWriter(str(folder / "tensorboard"), purge_step=0)
         self.close = self.writer.close
 
     def log(self, record: Record) -> None:
@@ -100,7 +101,12 @@ class WandbSink:
         )  # fmt: skip
         self.run.define_metric("update")
         self.run.define_metric("*", step_metric="update")
-        self.log, self.close = self.run.log, self.run.finish
+        self.close = self.run.finish
+
+    def log(self, record: Record) -> None:
+        """Sends a record as the step of its update, unless W&B has that step."""
+        if record["update"] >= self.run.step:
+            self.run.log(record, step=record["update"])
 
 
 def check_loggers(options: RunOptions) -> None:
@@ -112,23 +118,28 @@ def check_loggers(options: RunOptions) -> None:
             raise UserError(f"The package {package} is not installed; run: {line}")
 
 
-def open_loggers(
-    options: RunOptions, folder: Folder, update: int, say: Say
-) -> list[BackgroundLogger]:
-    """Starts the loggers asked for.
+def open_loggers(options: RunOptions, folder: Folder, say: Say) -> list[BackgroundLogger]:
+    """Starts the loggers asked for, each with all lines that metrics.jsonl has by now.
+
+    Which of them a logger lost with an earlier life of the run, nobody knows.
 
     Args:
       options: the run's options.
-      folder: the run.
-      update: where it goes on; what TensorBoard has after it is hidden.
+      folder: the run, cut back to where it goes on.
       say: told of a logger that is dropped.
     """
-    found = []
+    mode, project, found = options.wandb, options.wandb_project, dict[str, Callable[[], Any]]()
     if options.tensorboard:
-        found.append(
-            BackgroundLogger("TensorBoard", lambda: _TensorBoardSink(folder.path, update), say)
-        )
-    if options.wandb != "off":
-        mode, project = options.wandb, options.wandb_project
-        found.append(BackgroundLogger("W&B", lambda: WandbSink(folder, mode, project), say))
-    return found
+        found["TensorBoard"] = lambda: _TensorBoardSink(folder.path)
+    if mode != "off":
+        found["W&B"] = lambda: WandbSink(folder, mode, project)
+    owed = read_metrics(folder.metrics) if found else []
+    return [BackgroundLogger(k, partial(_send, sink, owed), say) for k, sink in found.items()]
+
+
+def _send(open_sink: Callable[[], Any], owed: Sequence[Record]) -> Any:
+    """Returns a sink that has got the records `owed`."""
+    sink = open_sink()
+    for record in owed:
+        sink.log(record)
+    return sink

@@ -19,7 +19,7 @@ from purerl.core.records import Metrics, PyTree, TrainState, count_as_int
 from purerl.devices.programs import Programs
 from purerl.machine import state_arrays
 from purerl.runs import checkpoint_folder
-from purerl.runs.metrics_file import MAX_SKIPPED_IN_A_ROW, Record
+from purerl.runs.metrics_file import MAX_SKIPPED_IN_A_ROW, Record, deviation
 from purerl.training.plan import Plan
 from purerl.training.writer import RunWriter
 
@@ -34,6 +34,7 @@ def train(
     progress: Any,
     stop: Callable[[], bool],
     meta: Record,
+    best: Sequence[float],
 ) -> None:
     """Runs from `state` to the end of the plan, or to a requested stop.
 
@@ -46,6 +47,8 @@ def train(
       stop: asked between chunks whether to save and stop.
       meta: what every checkpoint says; "update" is where `state` is, "wall_s" the time [s] that
         earlier lives of the run took.
+      best: each seed's highest evaluation return so far, -inf without one. What is better is saved,
+        so that the best evaluation has a checkpoint.
 
     Raises:
       StoppedError: stopped on request, saved.
@@ -63,18 +66,22 @@ def train(
         seconds = time.perf_counter() - begin
         records = _make_records(state, update, meta["wall_s"] + seconds, window, number)
         _check_finite(state, records, writers)
+        better = best
         if update in plan.evaluations:
             judged = _each_seed(jax.device_get(programs.evaluate(state)), number)
             for record, metrics in zip(records, judged, strict=True):
                 record |= _summarize_evaluation(metrics)
             progress.say(_describe_evaluation(records, plan))
+            scores = [record["eval/episode_return"] for record in records]
+            better = [max(old, new) for old, new in zip(best, scores, strict=True)]  # no NaN
         planned = update in plan.checkpoints
-        if planned or stop():
+        if planned or better != best or stop():
             _save(programs.fetch(state), records, writers, meta, planned)
             safe = update
         else:
             for writer, record in zip(writers, records, strict=True):
                 writer.write(record)
+        best = better
         rate = (update - first) / (time.perf_counter() - begin)
         left = (plan.updates - update) / rate
         progress.show(shown_record(records), left, rate * plan.steps_per_update * number)
@@ -141,9 +148,9 @@ def _summarize_evaluation(metrics: Metrics) -> Record:
     """Averages evaluation metrics, name -> [N], with the spread of the return."""
     arrays = {name: np.asarray(value, np.float64) for name, value in metrics.items()}
     record = {f"eval/{name}": float(values.mean()) for name, values in sorted(arrays.items())}
-    for name in ("std", "min", "max"):
-        record[f"eval/episode_return_{name}"] = float(getattr(arrays["episode_return"], name)())
-    return record
+    returns = arrays["episode_return"]
+    spread = {"std": deviation(returns), "min": returns.min(), "max": returns.max()}
+    return record | {f"eval/episode_return_{name}": float(x) for name, x in spread.items()}
 
 
 def _describe_evaluation(records: Sequence[Record], plan: Plan) -> str:
@@ -152,7 +159,7 @@ def _describe_evaluation(records: Sequence[Record], plan: Plan) -> str:
             if name.startswith("eval/")}  # fmt: skip
     spread, over = mean["eval/episode_return_std"], ""
     if len(records) > 1:
-        spread = np.std([record["eval/episode_return"] for record in records])
+        spread = deviation(np.array([record["eval/episode_return"] for record in records]))
         over = f" over {len(records)} seeds"
     lost = mean["eval/lost"]
     return (

@@ -133,11 +133,13 @@ def _train_together(job: Job, seeds: list[Seed], programs: Callable[[], Programs
                 writers = _open_writers(seeds, saved, job, say)
             for writer in writers:
                 stack.callback(writer.close)
-                writer.loggers = open_loggers(job.options, writer.folder, known["update"], say)
+                writer.loggers = open_loggers(job.options, writer.folder, say)
         meta = {name: known[name] for name in ("wall_s", "update")}
+        best = in_first_process(lambda: [writer.best() for writer in writers])
         stop = processes.agreed(job.stop)
         with program_errors():
-            loop.train(job.plan, compiled, compiled.spread(state), writers, progress, stop, meta)
+            state = compiled.spread(state)
+            loop.train(job.plan, compiled, state, writers, progress, stop, meta, best)
         for seed, writer in zip(seeds, writers, strict=True):
             of = f" of {seed.path.name}" if job.options.num_seeds > 1 else ""
             say(f"Done: {job.plan.steps:,} steps{of}. Digest {writer.digest}")

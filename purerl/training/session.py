@@ -12,6 +12,7 @@ from typing import Any
 import jax
 
 from purerl import exact
+from purerl.checks.held_arrays import hash_held
 from purerl.core.errors import UserError
 from purerl.core.records import PyTree
 from purerl.devices import compilation, processes
@@ -121,6 +122,8 @@ def _facts(
     inexact = getattr(setup.env, "inexact", "")
     facts = manifest.describe_process(setup.engine, builders, kernels, shards.number, inexact)
     facts["model"] = objects.physics_hash(setup.env)
+    with objects.naming_broken_rules(setup.env):
+        facts["arrays"] = hash_held(setup.env, setup.network)
     facts["experiment_file"] = str(source.path)
     if options.vmapped_seeds > 1:
         facts["vmapped_seeds"] = {"first": chosen.seed, "number": options.vmapped_seeds}

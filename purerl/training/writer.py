@@ -4,6 +4,7 @@ The order matters: a checkpoint says how long metrics.jsonl was when it was take
 when the disk has all of that. Training does not wait for hashes or the disk.
 """
 
+import math
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -64,7 +65,7 @@ class RunWriter:
         self.last_failure = ""  # why the newest checkpoint could not be saved; "": it could
 
     def write(self, record: Record) -> None:
-        """Hands a line to the loggers, and to the thread that appends it to metrics.jsonl."""
+        """Hands a line to the thread that appends it to metrics.jsonl, and to the loggers."""
         self._submit(self._write, record)
 
     def save(self, record: Record, leaves: Leaves, meta: dict[str, Any], planned: bool) -> None:
@@ -80,6 +81,11 @@ class RunWriter:
         if self.saving is not None:
             self.saving.exception()  # waits: two copies of the state in memory are enough
         self.saving = self._submit(self._save, record, leaves, meta, planned)
+
+    def best(self) -> float:
+        """Returns the highest evaluation return that a checkpoint of this stage has, else -inf."""
+        stages = checkpoint_folder.best_by_stage(self.checkpoints)
+        return stages.get(self.signature["fingerprint"], (-math.inf, 0))[0]
 
     def finish(self) -> None:
         """Waits until everything is on the disk; RunError if the last checkpoint is not."""
@@ -103,8 +109,6 @@ class RunWriter:
 
     def _submit(self, job: Any, record: Record, *arguments: Any) -> Future[None]:
         self._raise_broken()
-        for logger in self.loggers:
-            logger.log(dict(record))
         self.last = self.worker.submit(self._do, job, dict(record), *arguments)
         return self.last
 
@@ -121,8 +125,13 @@ class RunWriter:
         if self.broken is not None:
             raise self.broken
 
-    def _write(self, record: Record) -> None:
+    def _add(self, record: Record) -> None:
         self.metrics.add(record)
+        for logger in self.loggers:
+            logger.log(record)
+
+    def _write(self, record: Record) -> None:
+        self._add(record)
         self.lock.check()
         try:
             self.metrics.write()
@@ -131,7 +140,7 @@ class RunWriter:
 
     def _save(self, record: Record, leaves: Leaves, meta: dict[str, Any], planned: bool) -> None:
         digest = digest_leaves(leaves)
-        self.metrics.add(record | {"digest": digest} if planned else record)
+        self._add(record | {"digest": digest} if planned else record)
         for left in reversed(range(TRIES)):
             try:
                 self.lock.check()

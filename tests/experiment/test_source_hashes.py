@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import importlib
 import json
 import os
 import re
@@ -14,9 +15,9 @@ import pytest
 
 import purerl
 from purerl import run
-from purerl.core.errors import SUCCESS, USAGE
+from purerl.core.errors import SUCCESS, USAGE, UserError
 from purerl.devices import compilation
-from purerl.experiment import source_hashes
+from purerl.experiment import loading, source_hashes
 from purerl.ppo import losses
 from purerl.runs.loaded_run import Run
 from purerl.runs.manifest import differences
@@ -261,4 +262,92 @@ def test_an_edit_of_somebodys_own_source_changes_the_hashes(tmp_path, monkeypatc
     ]:
         before = source_hashes.source_hashes([task.build])
         edit(file)
+        source_hashes._seen.clear()  # as in a new process
         assert (source_hashes.source_hashes([task.build]) != before) == counts, file
+
+
+# --- one process, such as a notebook's: what ran is what is hashed ---
+
+EXPERIMENT = """
+from tests.runs.toy_experiment import experiment as toy
+import dataclasses
+import task_of_mine
+
+def build_env(options, engine):
+    return task_of_mine.SCALE
+
+experiment = dataclasses.replace(toy, build_env=build_env)
+"""
+
+
+class Notebook:
+    """Somebody's own files, and what comes of them in this process."""
+
+    def __init__(self, place: Path) -> None:
+        self.place = place
+        (place / "mine.py").write_text(EXPERIMENT)
+        self.write("task_of_mine", "from reward_of_mine import SCALE")
+
+    def write(self, name: str, text: str) -> None:
+        (self.place / f"{name}.py").write_text(text + "\n")
+
+    def run(self) -> tuple[float, str]:
+        """Returns what was built, and the hash of the module behind it."""
+        build = loading.load_file(self.place / "mine.py").experiment.build_env
+        return build(None, "c"), source_hashes.source_hashes([build])["reward_of_mine"]
+
+
+@pytest.fixture
+def notebook(tmp_path, monkeypatch) -> Notebook:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield Notebook(tmp_path)
+    for name in ("task_of_mine", "reward_of_mine"):
+        sys.modules.pop(name, None)
+
+
+def test_an_edited_module_beside_the_experiment_is_imported_anew(notebook):
+    found = {}
+    for scale in (1.0, 2.0, 1.0):  # in the same second, of the same size: as compiled code is kept
+        notebook.write("reward_of_mine", f"SCALE = {scale}")
+        built, code = notebook.run()
+        assert (built, code) == (scale, found.setdefault(scale, code))
+    assert len(set(found.values())) == 2
+
+
+def test_what_was_imported_and_edited_before_the_first_training_is_imported_anew(notebook):
+    notebook.write("reward_of_mine", "SCALE = 1.0")
+    importlib.import_module("task_of_mine")
+    notebook.write("reward_of_mine", "SCALE = 2.0")
+    assert notebook.run()[0] == 2.0
+
+
+def test_a_module_that_was_reloaded_by_hand_brings_those_that_hold_parts_of_it(notebook):
+    notebook.write("reward_of_mine", "SCALE = 1.0")
+    notebook.run()
+    notebook.write("reward_of_mine", "SCALE = 20.0")
+    importlib.reload(sys.modules["reward_of_mine"])
+    assert notebook.run()[0] == 20.0
+
+
+def test_the_hash_is_of_what_was_imported_also_when_it_is_edited_thereafter(notebook):
+    notebook.write("reward_of_mine", "SCALE = 1.0")
+    build = loading.load_file(notebook.place / "mine.py").experiment.build_env
+    before = source_hashes.source_hashes([build])
+    notebook.write("reward_of_mine", "SCALE = 2.0")
+    assert source_hashes.source_hashes([build]) == before and build(None, "c") == 1.0
+
+
+def test_a_comment_imports_nothing_anew(notebook):
+    notebook.write("reward_of_mine", "SCALE = 1.0")
+    notebook.run()
+    module = sys.modules["reward_of_mine"]
+    notebook.write("reward_of_mine", "SCALE = 1.0  # a comment")
+    notebook.run()
+    assert sys.modules["reward_of_mine"] is module
+
+
+def test_an_edit_of_this_package_needs_a_new_process(notebook, monkeypatch):
+    notebook.write("reward_of_mine", "SCALE = 1.0")
+    monkeypatch.setitem(source_hashes._seen, Path(losses.__file__), (losses.__spec__, b"x = 1"))
+    with pytest.raises(UserError, match="purerl.ppo.losses has been edited .* a new process"):
+        notebook.run()

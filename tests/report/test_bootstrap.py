@@ -1,5 +1,7 @@
 """Statistics over seeds: hand-worked values, scipy, and how often an interval holds the truth."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -66,6 +68,25 @@ def test_interval_against_a_slow_bootstrap():
     means = [stats.trim_mean(generator.choice(values, 8), 0.25) for _ in range(20_000)]
     found = bootstrap.iqm_interval([values])
     np.testing.assert_allclose(found, np.percentile(means, [2.5, 97.5]), atol=0.12)
+
+
+@pytest.mark.parametrize("n", [5, 6])
+def test_of_few_runs_every_resample_is_taken(n):
+    values = np.random.default_rng(n).normal(500.0, 200.0, n)
+    every = values[np.array([*itertools.product(range(n), repeat=n)])]
+    expected = np.percentile(bootstrap.interquartile_mean(every), [2.5, 97.5])
+    np.testing.assert_allclose(bootstrap.iqm_interval([values], seed=1), expected, rtol=1e-12)
+    np.testing.assert_allclose(
+        bootstrap.mean_interval(values), np.percentile(every.mean(1), [2.5, 97.5]), rtol=1e-12
+    )
+
+
+def test_of_two_groups_every_pair_of_resamples_is_taken():
+    x, y = np.random.default_rng(0).normal(size=(2, 5))
+    rows = np.array([*itertools.product(range(5), repeat=5)])
+    each = [bootstrap.interquartile_mean(values[rows]) for values in (x, y)]
+    expected = np.percentile(np.subtract.outer(*each), [2.5, 97.5])
+    np.testing.assert_allclose(bootstrap.difference_interval([x], [y]), expected, rtol=1e-12)
 
 
 def test_an_interval_holds_the_truth_about_as_often_as_measured():

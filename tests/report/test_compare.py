@@ -184,10 +184,63 @@ def test_the_picture_says_which_intervals_it_has_and_what_thin_lines_are(tmp_pat
             assert len(axes.collections) == (names != "few*") and legend[-1] == "each run"
     pyplot.close("all")
     assert titles == [
-        "Interquartile mean (no intervals below 5 seeds)",
+        "Mean (no intervals below 5 seeds)",
         "Interquartile mean, 95% intervals",
-        "Interquartile mean, 95% intervals where there are 5 seeds or more",
+        "Interquartile mean (below 4 seeds the mean), "
+        "95% intervals where there are 5 seeds or more",
     ]
+
+
+@pytest.mark.parametrize("n, iqm, tenth", [(3, None, None), (4, 2.5, None), (10, 5.5, 1.9)])
+def test_a_statistic_has_its_name_from_the_number_of_seeds_on_at_which_it_is_one(
+    tmp_path, capsys, n, iqm, tenth
+):
+    make_seeds(tmp_path / "runs", "a", np.arange(1.0, n + 1))
+    (group,) = found(tmp_path, tmp_path / "runs")["groups"]
+    assert (group["iqm"], group["score"]) == (iqm, np.mean(range(1, n + 1)))
+    assert group["tenth"] == (tenth and pytest.approx(tenth))
+    assert ("Below 4 seeds there is no IQM" in capsys.readouterr().out) == (iqm is None)
+
+
+# --- code ---
+
+
+def test_runs_of_other_code_are_groups_of_their_own_and_what_differs_is_named(tmp_path, capsys):
+    runs = tmp_path / "runs"
+    for name, code, final in (("old", "11", 1.0), ("new", "22", 9.0)):
+        about = {"source": {"mine": code, "envs": "0"}, "model": "m", "arrays": {"float32[2]": "a"}}
+        make_seeds(runs, name, [final] * 4, **about)
+    result = found(tmp_path, runs)
+    assert [(g["n"], g["iqm"]) for g in result["groups"]] == [(4, 9.0), (4, 1.0)]
+    assert result["settings_that_differ"].keys() == {"code"}
+    (against,) = result["versus_first"]  # of equal seeds
+    assert (against["same_seeds"], against["difference"]) == (4, -8.0)
+    assert "other conditions: source.mine: 22 -> 11" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("what", [{"model": "n"}, {"arrays": {"float32[2]": "b"}}])
+def test_another_model_and_other_data_are_other_code(tmp_path, what):
+    about = {"source": {"mine": "1"}, "model": "m", "arrays": {"float32[2]": "a"}}
+    make_run(tmp_path / "runs" / "a", 1, [1.0] * 4, **about)
+    make_run(tmp_path / "runs" / "b", 2, [1.0] * 4, **(about | what))
+    assert [g["n"] for g in found(tmp_path, tmp_path / "runs")["groups"]] == [1, 1]
+
+
+def test_code_tells_no_experiments_apart_that_settings_tell_apart(tmp_path):
+    make_seeds(tmp_path / "runs", "a", [1.0] * 2, source={"mine": "1"})
+    make_seeds(tmp_path / "runs", "b", [1.0] * 2, source={"mine": "2"}, rate=1.0)
+    labels = [group["label"] for group in found(tmp_path, tmp_path / "runs")["groups"]]
+    assert labels == ["ppo.learning_rate=0.001", "ppo.learning_rate=1.0"]
+
+
+def test_a_run_of_the_name_comes_before_runs_of_the_pattern(tmp_path):
+    make_run(tmp_path / "lr1", 1, [1.0] * 4)
+    make_run(tmp_path / "lr[1]", 1, [2.0] * 4)
+    assert run_reader.find_runs([tmp_path / "lr[1]"]) == [tmp_path / "lr[1]"]
+    assert run_reader.find_runs([tmp_path / "lr[12]"]) == [tmp_path / "lr1"]
+
+
+# --- how runs ended ---
 
 
 def test_failed_runs_count_and_unfinished_ones_do_not(tmp_path, capsys):

@@ -2,6 +2,7 @@
 
 import errno
 import hashlib
+import math
 import shutil
 from pathlib import Path
 
@@ -168,8 +169,25 @@ def test_the_newest_and_the_best_are_kept(tmp_path):
         save(tmp_path, update, score=score)
     checkpoint_folder.retain(tmp_path, 2)
     assert checkpoint_folder.updates(tmp_path) == [2, 4, 5]
-    assert checkpoint_folder.best_update(tmp_path) == 2
+    assert checkpoint_folder.best_by_stage(tmp_path) == {None: (9.0, 2)}
     assert not list(tmp_path.glob(".deleting*"))
+
+
+def test_the_best_of_each_stage_is_kept_and_the_last_stage_tells_which_is_best(tmp_path):
+    """Its return was doubled until update 3, where --allow-changes let another reward pass."""
+    stages = [(1, 50.0, "a"), (2, 80.0, "a"), (3, 60.0, "a"), (4, 30.0, "b"), (5, 20.0, "b")]
+    for update, score, stage in [*stages, (6, None, "b")]:
+        save(tmp_path, update, score=score, run={"fingerprint": stage})
+    checkpoint_folder.retain(tmp_path, 1)
+    assert checkpoint_folder.updates(tmp_path) == [2, 4, 6]
+    found = checkpoint_folder.best_by_stage(tmp_path)
+    assert list(found.items()) == [("a", (80.0, 2)), ("b", (30.0, 4))]
+
+
+def test_a_stage_without_an_evaluation_has_no_best(tmp_path):
+    for update, score, stage in [(1, 50.0, "a"), (2, None, "b")]:
+        save(tmp_path, update, score=score, run={"fingerprint": stage})
+    assert [*checkpoint_folder.best_by_stage(tmp_path).values()][-1] == (-math.inf, 2)
 
 
 def test_of_seeds_together_those_are_kept_that_all_have(tmp_path):

@@ -3,6 +3,7 @@
 import dataclasses
 import doctest
 import json
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -140,10 +141,37 @@ def test_metrics_are_columns_of_one_length(run, tmp_path):
     assert {len(column) for column in columns.values()} == {run.update}
     assert None in columns["digest"] or len(columns["digest"]) == run.update
     file = tmp_path / "metrics.jsonl"
+    (tmp_path / "config.json").touch()
     file.write_text('{"update": 1, "a": 0.5}\n{"update": 2, "b": null}\n{"update": 3, "a"')
     assert purerl.Run(tmp_path).metrics() == {
         "update": [1, 2], "a": [0.5, None], "b": [None, None]
     }  # fmt: skip
+
+
+def test_metrics_of_a_run_that_is_gone_are_an_error(tmp_path):
+    with pytest.raises(purerl.UserError, match="no folder"):
+        purerl.Run(tmp_path / "gone").metrics()
+
+
+def test_a_run_keeps_its_place_when_the_process_goes_elsewhere(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(run.folder.parent)
+    found = purerl.load(run.folder.name)
+    monkeypatch.chdir(tmp_path)
+    assert found.metrics() == run.metrics()
+
+
+def test_a_policy_is_pickled_with_what_it_remembers(run):
+    policy = run.policy
+    policy.reset()
+    seen = jax.tree.map(lambda x: np.ones((2, *x.shape)), policy._example)
+    policy(seen)
+    copied = pickle.loads(pickle.dumps(policy))
+    assert copied is not policy
+    np.testing.assert_array_equal(copied(seen), policy(seen))
+    assert pickle.loads(pickle.dumps(run)).digest == run.digest
+    by_hand = type(policy)(run.env, run.network, run.state)
+    with pytest.raises(purerl.UserError, match="of no run"):
+        pickle.dumps(by_hand)
 
 
 def test_metrics_start_no_jax(run):

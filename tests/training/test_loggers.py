@@ -5,12 +5,16 @@ import json
 import threading
 import time
 
+import numpy as np
 import pytest
 
+from purerl.checks import check_env
 from purerl.core.errors import UserError
 from purerl.runs.metrics_file import MetricsFile
+from purerl.training import loop
 from purerl.training.loggers import BackgroundLogger, _TensorBoardSink
 from purerl.training.loop import summarize
+from purerl.training.plan import Plan
 
 
 def test_counts_are_summed_and_episodes_weigh_by_their_number():
@@ -130,7 +134,25 @@ def test_a_logger_that_hangs_never_makes_training_wait():
 
 def test_tensorboard_files_are_written(tmp_path):
     pytest.importorskip("tensorboardX")
-    sink = _TensorBoardSink(tmp_path, 0)
+    sink = _TensorBoardSink(tmp_path)
     sink.log({"update": 1, "train/kl": 0.5, "eval/x": None})
     sink.close()
     assert b"train/kl" in next((tmp_path / "tensorboard").iterdir()).read_bytes()
+
+
+def test_what_an_evaluation_adds_is_reserved_and_deviations_are_of_samples():
+    own = {"episode_return": [1.0, 3.0], "episode_length": [4.0, 4.0], "lost": [0.0, 0.0]}
+    record = loop._summarize_evaluation({k: np.array(x) for k, x in own.items()})
+    assert {name.removeprefix("eval/") for name in record} == check_env.RESERVED
+    assert record["eval/episode_return_std"] == pytest.approx(2**0.5)  # over n - 1
+    alone = loop._summarize_evaluation({k: np.array(x[:1]) for k, x in own.items()})
+    assert alone["eval/episode_return_std"] == 0.0
+
+
+def test_the_spread_over_seeds_is_that_of_a_sample():
+    names = [*loop._summarize_evaluation(dict.fromkeys(("episode_return",), np.ones(1))), "lost"]
+    both = [dict.fromkeys((*names, "eval/lost", "eval/episode_length"), 0.0) for _ in range(2)]
+    both = [one | {"update": 1, "steps": 8} for one in both]
+    both[1]["eval/episode_return"] = 2.0
+    plan = Plan(1, 8, 1, (), ())
+    assert "return 1.00 +- 1.41 over 2 seeds" in loop._describe_evaluation(both, plan)

@@ -31,7 +31,7 @@ def draw(path: Path, rows: Sequence[Row], spaces: Sequence[Space], metric: str) 
       spaces: the swept settings, each a panel.
       metric: the score's name.
     """
-    rows = [row for row in rows if row.summary["iqm"] is not None]
+    rows = [row for row in rows if row.summary["score"] is not None]
     if not rows:
         return False
     columns = min(COLUMNS, len(spaces))
@@ -52,12 +52,12 @@ def draw(path: Path, rows: Sequence[Row], spaces: Sequence[Space], metric: str) 
 
 
 def _draw_panel(panel: Any, rows: Sequence[Row], space: Space) -> None:
-    """Draws a point's seeds, its IQM and interval; the line joins the medians of each value."""
+    """Draws a point's seeds, its score and interval; the line joins the medians of each value."""
     values = [row.typed[space.setting] for row in rows]
     names = sorted({str(value): value for value in values}.values(), key=by_value)
     numbers = all(map(is_number, values))
     place = [float(v) if numbers else float(names.index(v)) for v in values]
-    iqms = [row.summary["iqm"] for row in rows]
+    scores = [row.summary["score"] for row in rows]
     both = list(zip(place, rows, strict=True))
     seeds = [(x, y) for x, row in both for y in row.summary["runs"].values()]
     panel.plot(*zip(*seeds, strict=True), ".", color="0.7", markersize=4, label="one seed")
@@ -65,12 +65,12 @@ def _draw_panel(panel: Any, rows: Sequence[Row], space: Space) -> None:
         if row.summary["interval"]:
             ends = row.summary["interval"]
             panel.plot([x, x], [ends["low"], ends["high"]], color="C0", linewidth=1.5, alpha=0.5)
-    panel.plot(place, iqms, "o", color="C0", markersize=6, label="IQM of a point, 95% interval")
+    panel.plot(place, scores, "o", color="C0", markersize=6, label="score of a point, 95% interval")
     if rows[0].status == "done":
-        panel.plot(place[0], iqms[0], "o", color="C1", markersize=9, label="best point")
+        panel.plot(place[0], scores[0], "o", color="C1", markersize=9, label="best point")
     different = sorted(set(place))
     if space.choices and len(different) < len(place):
-        medians = [np.median([y for x, y in zip(place, iqms, strict=True) if x == one])
+        medians = [np.median([y for x, y in zip(place, scores, strict=True) if x == one])
                    for one in different]  # fmt: skip
         panel.plot(different, medians, color="C0", linewidth=1, label="median of the points")
     panel.set_xlabel(printable(space.setting))

@@ -198,7 +198,7 @@ class _Progress:
         point, metric, score = self.points[result.job.name], self.sweep.options.metric, None
         if result.status == "done":
             group = table.group_of(self.sweep.base, point)
-            score = table.summarize(group, metric)["iqm"]
+            score = table.summarize(group, metric)["score"]
             told_now = point.name in self.begun or len(self.results) == self.number
             if score is None and told_now:
                 table.check_metric(self.sweep.base, self.points.values(), metric)

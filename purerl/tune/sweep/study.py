@@ -1,8 +1,10 @@
 """Points that Optuna chooses by the scores so far; its own storage keeps them in the folder."""
 
 import importlib.util
+import sqlite3
 import warnings
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +30,11 @@ def open_study(folder: Path | None) -> Any:
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     warnings.filterwarnings("ignore", category=UserWarning, module="optuna")
-    storage = f"sqlite:///{folder / FILE}" if folder else None
+    storage = None
+    if folder:
+        # Connected to by path: in a URL, characters of a name are syntax.
+        connect = partial(sqlite3.connect, (folder / FILE).absolute(), check_same_thread=False)
+        storage = optuna.storages.RDBStorage("sqlite://", engine_kwargs={"creator": connect})
     return optuna.create_study(
         study_name="sweep", storage=storage, direction="maximize", load_if_exists=True
     )

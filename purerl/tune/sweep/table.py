@@ -62,7 +62,7 @@ def check_metric(base: Base, points: Iterable[Point], metric: str) -> None:
 
 
 def _rank(row: Row) -> tuple[Any, ...]:
-    score = row.summary["iqm"]
+    score = row.summary["score"]
     place = ORDER.index(row.status) if score is not None else len(ORDER)
     return (place, -(score or 0.0), *map(by_value, row.typed.values()), row.point.number)
 
@@ -88,7 +88,7 @@ def is_number(value: Any) -> bool:
 def as_record(row: Row) -> dict[str, Any]:
     """Returns a row as columns."""
     interval = row.summary["interval"] or {"low": None, "high": None}
-    names = ("n", "iqm", "mean", "worst")
+    names = ("n", "score", "mean", "worst")
     return {
         "point": row.point.name,
         **row.point.values,
@@ -102,7 +102,7 @@ def as_record(row: Row) -> dict[str, Any]:
 def describe(rows: Sequence[Row], spaces: Sequence[Space], metric: str) -> list[str]:
     """Returns the table as lines of text, then why points failed."""
     columns = [("point", "point"), *((space.setting, space.setting) for space in spaces)]
-    columns += [("n", "n"), ("IQM", "iqm"), ("95% interval", "interval"), ("worst", "worst")]
+    columns += [("n", "n"), ("score", "score"), ("95% interval", "interval"), ("worst", "worst")]
     columns += [("status", "status")]
     records = [as_record(row) | {"interval": row.summary["interval"]} for row in rows]
     for record in records:
@@ -137,7 +137,7 @@ def write(
     """Writes sweep.csv and sweep.txt; returns them by their kind."""
     files = {kind: folder / f"sweep.{kind}" for kind in ("csv", "txt")}
     names = ["point", *(space.setting for space in spaces)]
-    names += ["n", "iqm", "low", "high", "mean", "worst", "status", "said"]
+    names += ["n", "score", "low", "high", "mean", "worst", "status", "said"]
     with writing(folder):
         comparison.write_csv(files["csv"], names, map(as_record, rows))
         files["txt"].write_text("\n".join(lines) + "\n", errors="backslashreplace")

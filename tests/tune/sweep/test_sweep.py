@@ -38,10 +38,10 @@ def test_the_table_has_the_best_first_and_numbers_as_numbers(place, capsys):
     found = rows()
     assert [row["ppo.learning-rate"] for row in found] == ["2e-3", "9e-4", "1e-2"]
     scores = [3 - (rate - 3e-3) ** 2 for rate in (2e-3, 9e-4, 1e-2)]  # of the middle seeds
-    assert [float(row["iqm"]) for row in found] == pytest.approx(scores)
+    assert [float(row["score"]) for row in found] == pytest.approx(scores)
     for row in found:
         assert row["n"] == "5" and row["status"] == "done"
-        assert 1 <= float(row["low"]) < float(row["iqm"]) < float(row["high"]) <= 5
+        assert 1 <= float(row["low"]) < float(row["score"]) < float(row["high"]) <= 5
     assert "3 points (3 done), eval/episode_return at the end" in capsys.readouterr().out
     with Image.open("sweeps/toy_experiment/sweep.png") as picture:
         assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 20
@@ -179,7 +179,7 @@ def test_a_point_without_the_metric_has_no_score_and_stops_no_other(place):
         assert start(*words) == SUCCESS
         found = {row["ppo.gamma"]: row for row in rows()}
         assert len(found) == 3 and {row["status"] for row in rows()} == {"done"}
-        assert list(found)[-1] == "0.4" and found["0.4"]["iqm"] == ""
+        assert list(found)[-1] == "0.4" and found["0.4"]["score"] == ""
 
 
 @pytest.mark.slow
@@ -343,3 +343,14 @@ def test_a_sweep_that_was_killed_ends_as_one_left_in_peace(tmp_path, monkeypatch
         lines = [read_lines(Path("sweeps") / name, point) for name in ("peace", "killed")]
         assert lines[0] == lines[1] and list(map(len, lines[0])) == [150, 150]
     assert rows("killed") == rows("peace")
+
+
+@has("optuna")
+def test_a_study_is_in_its_own_folder_whatever_its_name(place):
+    from purerl.tune.sweep import study
+
+    for name in ("a?1", "a?2", "b%20#c [1]"):
+        folder = place / name
+        folder.mkdir()
+        study.open_study(folder).ask()
+        assert (folder / study.FILE).is_file() and len(study.open_study(folder).trials) == 1

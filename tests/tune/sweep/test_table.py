@@ -16,7 +16,14 @@ from tests.training.test_run import TOY
 def row(number: int, score, status: str = "done", **values) -> Row:
     texts = {name: str(value) for name, value in values.items()}
     runs = {} if score is None else {"seed1": score}
-    summary = {"iqm": score, "n": len(runs), "runs": runs, "interval": None, "mean": score}
+    summary = {
+        "score": score,
+        "iqm": None,
+        "n": len(runs),
+        "runs": runs,
+        "interval": None,
+        "mean": score,
+    }
     summary |= {"worst": score, "done": len(runs), "failed": 0, "unfinished": 0}
     return Row(Point(number, texts), values, status, "", summary)
 
@@ -60,7 +67,7 @@ def test_any_kind_of_value_is_drawn(tmp_path):
 
 def test_digits_are_few_and_what_has_no_run_brings_no_note():
     rows = [row(0, 1.0, x=0.000123456789), row(1, None, "failed", x=3)]
-    rows[0].summary["interval"] = {"low": 0.5, "high": 1.5}
+    rows[0].summary.update(n=5, done=5, interval={"low": 0.5, "high": 1.5})
     lines = table.describe(rows, [parse_space("x", "1", False)], "eval/x")
     assert "0.0001235" in lines[2] and "[0.5, 1.5]" in lines[2]
     assert lines[4:] == ["p0001 failed: "]
