@@ -62,6 +62,14 @@ def compiled_quickly(monkeypatch):
     monkeypatch.setattr(jax, "jit", quick.Jit)
 
 
+@pytest.fixture(scope="module")
+def file_is_compiled_quickly():
+    """The same for all tests of a file, and for what they share."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax, "jit", quick.Jit)
+        yield
+
+
 @pytest.fixture(scope="session")
 def kept_programs():
     """`seeds._compile` of this process's tests that let runs share what they compile."""
