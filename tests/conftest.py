@@ -27,6 +27,7 @@ import pytest  # noqa: E402
 
 from purerl.core.errors import RunError  # noqa: E402
 from purerl.report.opengl import open_gl  # noqa: E402
+from purerl.training import seeds  # noqa: E402
 from tests import quick  # noqa: E402
 
 # The same examples every time: a failure belongs to the change that is tested.
@@ -59,6 +60,31 @@ def compiled_quickly(monkeypatch):
     For tests in which bits do not matter.
     """
     monkeypatch.setattr(jax, "jit", quick.Jit)
+
+
+@pytest.fixture(scope="module")
+def file_is_compiled_quickly():
+    """The same for all tests of a file, and for what they share."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax, "jit", quick.Jit)
+        yield
+
+
+@pytest.fixture(scope="session")
+def kept_programs():
+    """`seeds._compile` of this process's tests that let runs share what they compile."""
+    return quick.kept(seeds._compile)
+
+
+@pytest.fixture(scope="module")
+def programs_are_kept(kept_programs):
+    """Runs of a file with equal settings share their programs: to trace them is half of a toy's.
+
+    What a process compiles by itself is tested where runs are processes.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(seeds, "_compile", kept_programs)
+        yield
 
 
 @pytest.fixture(scope="module", autouse=True)

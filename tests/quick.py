@@ -1,10 +1,14 @@
-"""Compiling in a quarter of the time what a test runs a few times."""
+"""Compiling in a quarter of the time what a test runs a few times, and a run's programs once."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
 from jax._src.core import trace_state_clean  # JAX has no public way to ask whether it traces
+
+from purerl import exact
+from purerl.experiment.settings_json import settings_of
 
 # Nothing of LLVM, and XLA's older loops, where it still has them: an update of the tests compiles
 # in 1.7 s of a core, not 6.7 (at LLVM's level 1 in 2.8). Other bits than a run's: where a test is
@@ -35,3 +39,23 @@ class Jit:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._quick, name)
+
+
+def kept(compile_job: Callable) -> Callable:
+    """Returns `seeds._compile` that traces and compiles once what all it depends on is equal of.
+
+    That is what the manifest says of a process, the settings, the seed among them, and whether the
+    run begins.
+    """
+    made: dict[str, Any] = {}
+
+    @functools.wraps(compile_job)
+    def once(job: Any, fresh: bool) -> Any:
+        settings, jit_used = settings_of(job.chosen), jax.jit is JAX_JIT
+        seeds = job.options.vmapped_seeds
+        key = repr((job.facts, settings, seeds, job.shards, fresh, exact.is_portable(), jit_used))
+        if key not in made:
+            made[key] = compile_job(job, fresh)
+        return made[key]
+
+    return once

@@ -39,7 +39,7 @@ def flat(observation) -> np.ndarray:
 def random_states(env, rng):
     """Starts of our own, moved about: qpos, qvel, ctrl and model changes, 100 of each."""
     keys = jax.random.split(jax.random.key(1), STATES)
-    start = quick.jit(jax.vmap(env.domain.start))(keys)
+    start = jax.device_get(quick.jit(jax.vmap(env.domain.start))(keys))
     model = env.physics.model
     for i in range(STATES):
         qpos, qvel = np.float64(start.qpos[i]), rng.normal(size=model.nv)
@@ -275,7 +275,7 @@ def test_starts_touch_nothing(name):
     keys = jax.random.split(jax.random.key(3), 128)
     starts = np.asarray(quick.jit(jax.vmap(env.domain.start))(keys).qpos)
     draw = getattr(env.domain, "_place_ball", lambda k: base.random_joints(model, k))
-    poses = np.asarray(jax.vmap(draw)(jax.random.clone(keys)))
+    poses = np.asarray(quick.jit(jax.vmap(draw))(jax.random.clone(keys)))
     pairs = base.touching_pairs(model)
     gap = quick.jit(lambda p, m: base.least_gap(model, pairs, p, m))
     touching = [_contacts(model, data, q) > 0 for q in starts]
@@ -301,9 +301,8 @@ def test_random_joints_have_their_ranges():
     """Against dm_control's own draw, joint by joint: the same least and greatest."""
     for name in ("walker-stand", "humanoid-stand", "hopper-hop"):
         model = ours(name).physics.model
-        qpos = jax.vmap(lambda k, m=model: base.random_joints(m, k))(
-            jax.random.split(jax.random.key(0), 2000)
-        )
+        draw = quick.jit(jax.vmap(lambda k, m=model: base.random_joints(m, k)))
+        qpos = np.asarray(draw(jax.random.split(jax.random.key(0), 2000)))
         physics = suite.load(*name.split("-")).physics
         rng, theirs = np.random.RandomState(0), []
         for _ in range(2000):

@@ -9,6 +9,7 @@ import pytest
 
 from purerl import new
 from purerl.experiment.new_project import write_project
+from tests import quick
 
 ROOT = Path(new.__file__).parent.parent
 
@@ -49,7 +50,7 @@ def test_its_files_bear_its_name(inside):
 def said(project, module, *words):
     """Returns what a command prints in the project's folder; it has to succeed."""
     command = [sys.executable, "-m", module, *words]
-    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "XLA_FLAGS": quick.FLAGS}
     done = subprocess.run(command, capture_output=True, text=True, cwd=project, env=env)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

@@ -18,9 +18,10 @@ from purerl.core.errors import FAILURE, SUCCESS, USAGE, RunError, UserError
 from purerl.machine import command_errors, output
 from purerl.machine.files import write_answer
 from purerl.report import opengl
+from tests import quick
 from tests.training.test_run import ROOT, TOY, digest, folder, whole  # noqa: F401
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("programs_are_kept")]
 
 
 def shell(line: str, *words: str) -> subprocess.CompletedProcess:
@@ -30,7 +31,8 @@ def shell(line: str, *words: str) -> subprocess.CompletedProcess:
 
 
 def train(place: Path, line: str, *words: str) -> subprocess.CompletedProcess:
-    return shell(line, "purerl.run", str(TOY), "--runs", str(place), "--checkpoints", "4", *words)
+    few = ["--checkpoints", "4", "--evaluation.number", "0"]  # which changes no bit
+    return shell(line, "purerl.run", str(TOY), "--runs", str(place), *few, *words)
 
 
 LOST = "purerl: Standard output cannot be written: {}. Training goes on without it.\n"
@@ -67,7 +69,7 @@ def test_a_bar_whose_terminal_goes_away_ends_no_training(whole, tmp_path):  # no
     words = [sys.executable, "-m", "purerl.run", str(TOY), "--runs", str(tmp_path)]
     process = subprocess.Popen(
         [*words, "--ppo.num-steps", "64000"], cwd=ROOT, stdout=theirs, stderr=subprocess.PIPE,
-        start_new_session=True, env=os.environ | {"TERM": "xterm"},
+        start_new_session=True, env=os.environ | {"TERM": "xterm", "XLA_FLAGS": quick.FLAGS},
     )  # fmt: skip
     os.close(theirs)
     shown = b""

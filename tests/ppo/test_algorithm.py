@@ -80,7 +80,7 @@ def setup(config=CONFIG, env=None, recurrent=False, seed=0):
     network = NETWORKS[recurrent]
     state = INIT(config, env, network, jax.random.key(seed))
     samples = jax.random.normal(jax.random.key(9), (50, 2)) * 2.0 + 0.3
-    statistics = merge_batch(state.normalizer, samples, jnp.ones(50, bool))
+    statistics = MERGE(state.normalizer, samples, jnp.ones(50, bool))
     return env, network, state.replace(normalizer=statistics)
 
 
@@ -88,6 +88,12 @@ def learn(config, network, state, batch, memory):
     """Learns from one part."""
     batch, memory, part_id = as_one_part((batch, memory, jnp.zeros((), jnp.int32)))
     return learner.learn(config, network, state, batch, memory, part_id, WHOLE)
+
+
+LEARN = quick.jit(learn, static_argnums=(0, 1))
+MAKE_BATCH = quick.jit(batches.make_batch, static_argnums=0)
+MERGE = quick.jit(merge_batch)
+EVALUATE = quick.jit(evaluation.evaluate_policy, static_argnums=(0, 1, 4, 5))
 
 
 @pytest.mark.parametrize("recurrent", [False, True])
@@ -109,7 +115,7 @@ def test_statistics_are_frozen_until_the_end_of_the_update():
     assert count_as_int(after.normalizer.count) == 50
     updated, _ = UPDATE(CONFIG, env, network, state)
     assert count_as_int(updated.normalizer.count) == 50 + 6 * 16
-    expected = merge_batch(state.normalizer, transitions.observation, jnp.ones((16, 6), bool))
+    expected = MERGE(state.normalizer, transitions.observation, jnp.ones((16, 6), bool))
     np.testing.assert_allclose(
         updated.normalizer.mean.value, expected.mean.value, rtol=1e-5, atol=1e-6
     )
@@ -133,7 +139,7 @@ def test_time_limits_truncate_and_the_first_are_staggered():
 def test_training_episodes_have_limits_from_the_shortest_to_whole_ones_each_environment_its_own():
     config = dataclasses.replace(CONFIG, shortest_episode=2)
     env, network, _ = setup()
-    state = algorithm.init(config, env, network, jax.random.key(4))
+    state = INIT(config, env, network, jax.random.key(4))
     own = [2, 3, 3, 4, 5, 7]  # 2 * (7 / 2) ** (i / 5), to the nearest
     assert (np.asarray(state.episode.limit) <= own).all()
     _, transitions, _ = ROLLOUT(config, env, network, state)
@@ -196,7 +202,7 @@ def slow_batch(transitions, last_value, observations_before_reset, value_of, gam
 def test_truncation_bootstraps_from_the_observation_before_the_reset():
     env, network, state = setup(env=Walk(edge=1.5))
     after, transitions, _ = ROLLOUT(CONFIG, env, network, state)
-    batch = batches.make_batch(CONFIG, state, transitions)
+    batch = MAKE_BATCH(CONFIG, state, transitions)
     transitions = jax.tree.map(np.asarray, transitions)
     assert transitions.terminated.any() and transitions.truncated.any()
     moved = transitions.observation[..., 0] + np.tanh(transitions.raw_action[..., 0])
@@ -224,7 +230,7 @@ def test_recurrent_memory_restarts_with_each_episode_in_rollout_and_learner():
         state, _ = update(state)
     assert jnp.abs(state.memory).max() > 0
     _, transitions, _ = ROLLOUT(CONFIG, env, network, state)
-    batch = batches.make_batch(CONFIG, state, transitions)
+    batch = MAKE_BATCH(CONFIG, state, transitions)
     output = learner.unroll(network, state.params, batch, state.memory)
     np.testing.assert_allclose(output.value, transitions.value, rtol=1e-5, atol=1e-6)
     # By hand: at a start the memory is zero.
@@ -297,8 +303,8 @@ def test_a_lost_sample_has_no_weight_in_the_update():
     )
     learned = []
     for x in (lost, odd):
-        batch = batches.make_batch(CONFIG, state, x)
-        learned.append(learn(CONFIG, network, state, batch, ())[0])
+        batch = MAKE_BATCH(CONFIG, state, x)
+        learned.append(LEARN(CONFIG, network, state, batch, ())[0])
     for a, b in zip(*(jax.tree.leaves(x.params) for x in learned), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -308,13 +314,13 @@ def test_advantages_are_clipped_after_they_are_normalized(least, clip):
     """The first ratio is 1: the loss of one minibatch is minus the mean of what it was given."""
     env, network, state = setup()
     _, transitions, _ = ROLLOUT(CONFIG, env, network, state)
-    batch = batches.make_batch(CONFIG, state, transitions)
+    batch = MAKE_BATCH(CONFIG, state, transitions)
     advantage = jnp.linspace(-1.0, 1.0, 96).reshape(16, 6).at[5, 2].set(-30.0)  # one failure
     config = dataclasses.replace(
         CONFIG, num_epochs=1, num_minibatches=1, advantage_clip=clip, min_advantage_std=least
     )
     batch = batch._replace(advantage=advantage)
-    metrics = learn(config, network, state, batch, ())[1]
+    metrics = LEARN(config, network, state, batch, ())[1]
     assert 1.0 < advantage.std() < 5.0
     given = (advantage - advantage.mean()) / max(advantage.std(), least)
     if clip:
@@ -325,12 +331,12 @@ def test_advantages_are_clipped_after_they_are_normalized(least, clip):
 def test_the_entropy_bonus_leaves_a_policy_alone_that_is_above_its_target():
     env, network, state = setup()
     _, transitions, _ = ROLLOUT(CONFIG, env, network, state)
-    batch = batches.make_batch(CONFIG, state, transitions)
+    batch = MAKE_BATCH(CONFIG, state, transitions)
 
     def moved(**settings):
         config = dataclasses.replace(CONFIG, num_epochs=1, num_minibatches=1, **settings)
         return np.concatenate([x.ravel() for x in jax.tree.leaves(
-            learn(config, network, state, batch, ())[0].params)])  # fmt: skip
+            LEARN(config, network, state, batch, ())[0].params)])  # fmt: skip
 
     none = moved(entropy_weight=0.0)  # its entropy is about 0.5
     np.testing.assert_allclose(moved(entropy_weight=1.0, entropy_target=0.1), none, atol=1e-7)
@@ -411,21 +417,21 @@ def test_a_memory_may_hold_integers():
     state = INIT(CONFIG, Walk(), counting, jax.random.key(0))
     state, metrics = UPDATE(CONFIG, Walk(), counting, state)
     assert state.memory["count"].dtype == jnp.int32 and metrics["skipped_minibatches"] == 0
-    evaluation.evaluate_policy(Walk(), counting, state, jax.random.key(1), 2, LENGTH)
+    EVALUATE(Walk(), counting, state, jax.random.key(1), 2, LENGTH)
 
 
 def test_a_non_finite_minibatch_is_skipped_and_counted():
     env, network, state = setup()
     _, transitions, _ = ROLLOUT(CONFIG, env, network, state)
     broken = transitions._replace(reward=transitions.reward.at[:].set(jnp.nan))
-    batch = batches.make_batch(CONFIG, state, broken)
-    after, metrics = learn(CONFIG, network, state, batch, ())
+    batch = MAKE_BATCH(CONFIG, state, broken)
+    after, metrics = LEARN(CONFIG, network, state, batch, ())
     assert metrics["skipped_minibatches"] == metrics["skipped_in_a_row"] == 6
     assert np.isfinite(metrics["policy_loss"])
     for a, b in zip(jax.tree.leaves(state.params), jax.tree.leaves(after.params), strict=True):
         np.testing.assert_array_equal(a, b)
-    sound = batches.make_batch(CONFIG, state, transitions)
-    again, _ = learn(CONFIG, network, after, sound, ())
+    sound = MAKE_BATCH(CONFIG, state, transitions)
+    again, _ = LEARN(CONFIG, network, after, sound, ())
     assert again.skipped_in_a_row == 0
 
 

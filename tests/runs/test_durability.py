@@ -29,6 +29,9 @@ from tests.training.test_run import (
     whole,  # noqa: F401 (a fixture)
 )
 
+# Bits are compared with those of runs that are compiled so too.
+pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly", "programs_are_kept")
+
 WORDS = ("--checkpoints", "4")
 
 

@@ -16,7 +16,10 @@ from purerl import compare, evaluate, run
 from purerl.core.errors import FAILURE, SUCCESS, USAGE
 from purerl.runs import checkpoint_folder, metrics_file
 
-pytestmark = pytest.mark.slow
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.usefixtures("file_is_compiled_quickly", "programs_are_kept"),
+]
 
 TOY = Path(__file__).parent / "toy_experiment.py"
 FEW = ["--episodes", "1"]

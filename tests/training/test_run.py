@@ -20,8 +20,7 @@ import pytest
 from purerl import run
 from purerl.core import errors
 from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
-from purerl.devices import compilation
-from purerl.devices.programs import compile_programs
+from purerl.devices import compilation, multi_device, programs
 from purerl.devices.shards import Shards
 from purerl.experiment import objects
 from purerl.experiment.loading import find
@@ -29,6 +28,9 @@ from purerl.machine import command_errors, files, state_arrays
 from purerl.ppo.config import Evaluation
 from purerl.runs import checkpoint, checkpoint_folder, folder as run_folder, loaded_run, resume
 from purerl.training import console, train, writer
+from tests import quick
+
+pytestmark = pytest.mark.usefixtures("programs_are_kept")
 
 TOY = Path(__file__).parent.parent / "runs" / "toy_experiment.py"
 ROOT = TOY.parent.parent.parent
@@ -100,7 +102,7 @@ def stop_after(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory) -> Path:
+def whole(programs_are_kept, tmp_path_factory) -> Path:
     """A run that nobody disturbed."""
     runs = tmp_path_factory.mktemp("whole")
     assert start(runs, "--checkpoints", "4") == SUCCESS
@@ -203,15 +205,22 @@ def test_a_run_killed_in_its_first_save_begins_as_it_did(whole, tmp_path, stop_a
     assert lines(tmp_path) == lines(whole)
 
 
+def no_update(*_) -> compilation.Compiling:
+    return compilation.Compiling(lambda: (None, {}), [], judged=None)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("num_shards", [1, 2])
-def test_a_beginning_has_the_same_bits_however_it_is_compiled(num_shards):
+def test_a_beginning_has_the_same_bits_however_it_is_compiled(num_shards, monkeypatch):
+    """Without the update, which takes longest to compile."""
+    for module in (programs, multi_device):
+        monkeypatch.setattr(module, "compile_update", no_update)
     chosen = find("cartpole_swingup")
     chosen = dataclasses.replace(chosen, engine="c", evaluation=Evaluation(number=0))
     setup = objects.build(chosen)
     digests = set()
     for fresh in (True, False):  # ahead of time, or when it is called
-        compiled = compile_programs(
+        compiled = programs.compile_programs(
             *setup[:3], chosen.evaluation, fresh, Shards(num_shards, 1), calls_host=True
         )
         state = state_arrays.flatten(compiled.init(jax.random.key(1)))
@@ -224,13 +233,14 @@ def test_with_xla_on_one_thread_the_cores_do_not_matter(tmp_path):
     """MuJoCo's threads change no bits; the size of XLA's own pool does, for this ant."""
     words = ["ant_run", "--engine", "c", "--ppo.num-envs", "64", "--ppo.rollout-length", "32"]
     words += ["--ppo.num-steps", "4096", "--evaluation.number", "0", "--runs", str(tmp_path)]
+    environment = {"NPROC": "1", "XLA_FLAGS": f"{os.environ['XLA_FLAGS']} {quick.FLAGS}"}
     own = sorted(os.sched_getaffinity(0))
     try:
         for number in {1, len(own)}:
             os.sched_setaffinity(0, own[:number])  # the child inherits it
             subprocess.run(
                 [sys.executable, "-m", "purerl.run", *words, "--name", str(number)],
-                cwd=ROOT, env=os.environ | {"NPROC": "1"}, check=True, stdout=subprocess.DEVNULL,
+                cwd=ROOT, env=os.environ | environment, check=True, stdout=subprocess.DEVNULL,
             )  # fmt: skip
     finally:
         os.sched_setaffinity(0, own)
@@ -239,10 +249,10 @@ def test_with_xla_on_one_thread_the_cores_do_not_matter(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory) -> list[dict]:
+def undisturbed(programs_are_kept, tmp_path_factory) -> list[dict]:
     """The lines of a run that nothing stops."""
     place = tmp_path_factory.mktemp("undisturbed")
-    assert spawn(place, *LONG).wait(120) == SUCCESS
+    assert start(place, *LONG) == SUCCESS
     return lines(place)
 
 
@@ -344,6 +354,7 @@ def test_a_last_checkpoint_that_fails_is_an_error(tmp_path, monkeypatch, capsys,
     assert "The last checkpoint could not be saved" in said and "memory" not in said
 
 
+@pytest.mark.usefixtures("compiled_quickly")
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "reason", "update"),
@@ -437,6 +448,7 @@ def test_a_read_only_folder_is_told_and_unharmed(whole, unprivileged, capsys):
     assert [f.read_bytes() for f in sorted(place.rglob("*")) if f.is_file()] == before
 
 
+@pytest.mark.usefixtures("compiled_quickly")
 def test_a_run_begun_under_other_conditions_lists_them(tmp_path, stop_after, capsys):
     stop_after(9)
     start(tmp_path)
@@ -458,6 +470,7 @@ def test_a_run_begun_under_other_conditions_lists_them(tmp_path, stop_after, cap
     assert json.loads(file.read_text())["run_id"] == facts["run_id"] and "of" not in allowed[0]
 
 
+@pytest.mark.usefixtures("compiled_quickly")
 @pytest.mark.parametrize("changed, counted", [("ppo.learning-rate=3e-4", 24), ("env.steps=6", 12)])
 def test_a_copy_that_goes_on_otherwise_is_a_run_of_its_own(tmp_path, changed, counted):
     """Another reward begins a stage, so the returns before it do not count any more."""

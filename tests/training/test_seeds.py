@@ -15,6 +15,9 @@ from purerl.runs import checkpoint, checkpoint_folder
 from purerl.training import console, loop, seeds, train, writer
 from tests.training.test_run import ROOT, TOY, Stopper, digest, folder, lines, start
 
+# Bits are compared with those of runs that are compiled so too.
+pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly", "programs_are_kept")
+
 CARTPOLE = ["--ppo.num-envs", "4", "--ppo.rollout-length", "8", "--ppo.num-steps", "128"]
 CARTPOLE += ["--ppo.num-minibatches", "2", "--evaluation.number", "1"]
 CARTPOLE += ["--evaluation.num-episodes", "2", "--ppo.episode-length", "20", "--engine", "c"]

@@ -27,6 +27,8 @@ from purerl.experiment.settings_json import from_json, settings_of, to_json
 from purerl.training import train
 from tests.runs import toy_experiment
 
+pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly", "programs_are_kept")
+
 TOY = Path(__file__).parent.parent / "runs" / "toy_experiment.py"
 ROOT = TOY.parent.parent.parent
 SETTINGS = {"seed": 3, "env.steps": 3, "network.policy_hidden": (5, 6), "ppo.learning_rate": 1e-3}
