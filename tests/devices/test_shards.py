@@ -53,13 +53,13 @@ def start(runs: Path, devices: int, *words: str, expect: int = SUCCESS, flags: s
     return said
 
 
-def start_two(runs: Path, *words: str, flags: str = "", devices: int = 1) -> list[subprocess.Popen]:
-    """Starts a run of two processes with so many devices each."""
+def start_two(runs: Path, *words: str, flags: str = "") -> list[subprocess.Popen]:
+    """Starts a run of two processes with a device each."""
     with socket.socket() as probe:
         probe.bind(("localhost", 0))
         port = probe.getsockname()[1]
     places = [f"localhost:{port},2,{i}" for i in range(2)]
-    return [spawn(runs, devices, *words, "--distributed", place, flags=flags) for place in places]
+    return [spawn(runs, 1, *words, "--distributed", place, flags=flags) for place in places]
 
 
 def both_end(processes: list[subprocess.Popen], code: int) -> list[str]:
@@ -90,14 +90,12 @@ def toy(tmp_path_factory) -> Path:
 @pytest.mark.parametrize("engine", ["c", "jax"])
 def test_physics_is_the_same_on_any_number_of_devices(tmp_path, engine):
     words = [*CARTPOLE, "--engine", engine, "--num-shards", "4"]
-    start(tmp_path, 1, *words, "--name", "one", flags=QUICKLY)
-    words += ["--name", "others"]
-    if engine == "jax":  # which puts its model on a device: in each process on its own two
-        both_end(start_two(tmp_path, *words, flags=QUICKLY, devices=2), SUCCESS)
-    else:
-        start(tmp_path, 2, *words, flags=QUICKLY)
-    one, others = (lines(tmp_path / "cartpole_swingup" / name) for name in ("one", "others"))
-    assert one == others
+    for devices in (1, 2):
+        start(tmp_path, devices, *words, "--name", str(devices), flags=QUICKLY)
+    if engine == "jax":  # which puts its model on a device: in two processes, each on its own
+        both_end(start_two(tmp_path, *words, "--name", "apart", flags=QUICKLY), SUCCESS)
+    one, *others = (lines(folder) for folder in sorted((tmp_path / "cartpole_swingup").iterdir()))
+    assert len(others) == (2 if engine == "jax" else 1) and all(other == one for other in others)
     assert one[-1]["train/reward"] > 0 and one[-1]["eval/episode_return"] > 0
 
 
