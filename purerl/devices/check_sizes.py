@@ -27,12 +27,20 @@ def check_divides(
 def check_minibatches(config: Config, recurrent: bool, size: int, name: str = "num_envs") -> None:
     """Checks that the minibatches divide a rollout of `size` environments, called `name`.
 
-    Those of a `recurrent` network hold whole rollouts.
+    Those of a `recurrent` network hold whole rollouts. A minibatch of one step is refused: an
+    advantage less the mean of itself alone is 0, so the policy would never move.
     """
     because = " The minibatches of a recurrent network hold whole rollouts." if recurrent else ""
     if not recurrent:
         size, name = size * config.rollout_length, f"{name} * rollout_length"
     check_divides(name, size, "num_minibatches", config.num_minibatches, because)
+    if config.steps_per_update == config.num_minibatches:
+        least = next((d for d in range(2, math.isqrt(size) + 1) if size % d == 0), size)
+        fewer = f"num_minibatches could be {size // least} or a divisor of it, or " * (size > 1)
+        raise ValueError(
+            f"num_minibatches = {size} leaves each minibatch one step, whose advantage is its own "
+            f"mean, so the policy would never move; {fewer}raise num_envs * rollout_length."
+        )
 
 
 def check_shards(shards: Shards, num_envs: int) -> None:

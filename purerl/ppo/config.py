@@ -19,7 +19,7 @@ class Config:
     num_epochs: int = 4
     """Passes over each rollout."""
     num_minibatches: int = 16
-    """Gradient steps in one pass."""
+    """Gradient steps in one pass, each of 2 control steps at least."""
     episode_length: int = 1000
     """Time limit of an episode [control steps]; reaching it truncates."""
     # Where the goal is reached soon, a start is what is to be learned.
