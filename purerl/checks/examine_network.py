@@ -91,6 +91,12 @@ def _probe(network: Network, params: PyTree, inputs: PyTree, memory: PyTree) -> 
     return twice(params, inputs), (of_value, of_policy, of_parameters)
 
 
+def trained(params: PyTree) -> PyTree:
+    """Returns what is trained: of Flax's variables `params` alone (`networks.from_linen`)."""
+    is_flax = isinstance(params, dict) and "params" in params
+    return {"params": params["params"]} if is_flax else params
+
+
 def _check_memory(before: PyTree, after: PyTree) -> Iterator[Finding]:
     leaves = list(zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True))
     if leaves and all((np.asarray(a) == b).all() for a, b in leaves):
@@ -123,7 +129,7 @@ def _observations(names: list[str]) -> str:
 
 def _check_parameters(gradients: PyTree, moved: PyTree) -> Finding:
     """Tells which gradients are not finite at first, and which are zero after a step too."""
-    found, later = flatten(gradients), flatten(moved)
+    found, later = flatten(trained(gradients)), flatten(trained(moved))
     broken = [name for name, x in found.items() if _bad(x)]
     if broken:
         return error("gradients", f"of {some(broken)} are not finite.")

@@ -157,6 +157,9 @@ class RecurrentActorCritic(nn.Module):
 def from_linen(module: nn.Module, observation: PyTree, memory: PyTree = ()) -> Network:
     """Adapts a Flax module to `Network`.
 
+    Its collection `params` is trained. All others, such as `batch_stats`, are data: they stay as
+    `init` makes them, and a module that would change one is refused by Flax.
+
     Args:
       module: `module(observation) -> PolicyOutput`, or, with a memory,
         `module(observation, memory) -> (PolicyOutput, memory)`. Leading axes are batch axes.
@@ -173,10 +176,9 @@ def from_linen(module: nn.Module, observation: PyTree, memory: PyTree = ()) -> N
         return module.init(key, *arguments), memory
 
     def apply(params: PyTree, observation: PyTree, memory: PyTree) -> tuple[PolicyOutput, PyTree]:
-        if recurrent:
-            return module.apply(params, observation, memory)
-        output: Any = module.apply(params, observation)
-        return output, memory
+        stay = {k: jax.lax.stop_gradient(x) for k, x in params.items() if k != "params"}
+        output: Any = module.apply(params | stay, observation, *([memory] if recurrent else ()))
+        return output if recurrent else (output, memory)
 
     return Network(init=init, apply=apply)
 

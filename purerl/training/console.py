@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 
+from purerl.checks.examine_network import trained
 from purerl.core.records import PyTree
 from purerl.devices import threads
 from purerl.devices.memory import size
@@ -47,7 +48,7 @@ def describe_plan(
     if "vmapped_seeds" in facts:
         how = "vmapped: the statistics of single runs, other bits"
     inexact = "; ".join(facts["inexact_because"])
-    parameters = sum(leaf.size for leaf in jax.tree.leaves(abstract.params))
+    parameters = sum(leaf.size for leaf in jax.tree.leaves(trained(abstract.params)))
     lines = {
         "run": runs[0],
         "seeds": len(runs) > 1 and f"{len(runs)}, to {runs[-1].name}, {how}",
