@@ -226,8 +226,6 @@ def check_finite(when: str, state: PyTree) -> None:
 
 def lost_part(state: PyTree) -> str:
     """Names what is NaN or absurd in states that were reset because they were lost, or ""."""
-    if jax.process_count() > 1:  # each has a part of them only
-        return ""
     try:
         check_finite("reset", state)
     except EnvError as error:

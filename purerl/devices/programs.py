@@ -14,10 +14,10 @@ import jax
 
 from purerl.core.env import Env
 from purerl.core.keys import Purpose, derive
-from purerl.core.records import Array, Metrics, Network, PyTree, TrainState
+from purerl.core.records import Array, Metrics, Network, Normal, PyTree, TrainState
 from purerl.devices import compilation, multi_device
 from purerl.devices.shards import Shards, improve
-from purerl.ppo import algorithm
+from purerl.ppo import algorithm, episodes
 from purerl.ppo.config import Config, Evaluation
 from purerl.ppo.evaluation import evaluate_policy
 
@@ -32,6 +32,7 @@ class Programs(NamedTuple):
     update: Callable[[Any], tuple[Any, Metrics]]
     evaluate: Callable[[Any], Metrics]
     seconds: dict[str, float]  # that each took to compile, side by side; without the evaluation
+    policy: Callable[[TrainState], Normal]  # [B, A] of a fetched state
     unordered: list[str]  # sums of the update whose order nothing fixes on a GPU
     spread: Callable[[TrainState], Any] = compilation.as_it_is  # onto the devices, for the others
     fetch: Callable[[Any], TrainState] = compilation.as_it_is  # back onto one
@@ -69,9 +70,10 @@ def compile_programs(
     # Initialisation is a program too: computed operation by operation, it has other bits.
     init: Any = functools.partial(algorithm.init, config, env, network)
     judge: Any = functools.partial(evaluate_in_run, config, env, network, evaluation.num_episodes)
+    policy: Any = functools.partial(policy_of, network)
     key = jax.random.key(0)
     if vmapped_seeds > 1:
-        init, judge = jax.vmap(init), jax.vmap(judge)
+        init, judge, policy = jax.vmap(init), jax.vmap(judge), jax.vmap(policy)
         key = jax.random.split(key, vmapped_seeds)
     with compilation.no_collection():
         abstract = jax.eval_shape(init, key)
@@ -96,6 +98,7 @@ def compile_programs(
         unordered=compiling.unordered,
         spread=compiling.spread,
         fetch=compiling.fetch,
+        policy=jax.jit(policy),
     )
 
 
@@ -105,6 +108,11 @@ def evaluate_in_run(
     """Evaluates the deterministic policy on episodes that depend on seed and update alone."""
     key = derive(state.key, Purpose.EVALUATION, state.update)
     return evaluate_policy(env, network, state, key, num_episodes, config.episode_length)
+
+
+def policy_of(network: Network, state: TrainState) -> Normal:
+    """Returns the policy in the environments of a state, [B, A]."""
+    return episodes.act(network, state, state.env_state, state.memory)[0].distribution
 
 
 def compile_update(

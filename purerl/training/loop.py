@@ -23,6 +23,7 @@ from purerl.runs.metrics_file import MAX_SKIPPED_IN_A_ROW, Record, deviation
 from purerl.training.plan import Plan
 from purerl.training.writer import RunWriter
 
+LEAST_SCALE = 1e-6  # of a policy: the density of a smaller one overflows, or its gradient
 COUNTS = ("episodes", "nonfinite_resets", "replayed_resets", "skipped_minibatches")
 
 
@@ -65,7 +66,7 @@ def train(
         update = end
         seconds = time.perf_counter() - begin
         records = _make_records(state, update, meta["wall_s"] + seconds, window, number)
-        _check_finite(state, records, writers)
+        _check_finite(programs, state, records, writers)
         better = best
         if update in plan.evaluations:
             judged = _each_seed(jax.device_get(programs.evaluate(state)), number)
@@ -185,14 +186,14 @@ def shown_record(records: Sequence[Record]) -> Record:
 
 
 def _check_finite(
-    state: TrainState, records: Sequence[Record], writers: Sequence[RunWriter]
+    programs: Programs, state: Any, records: Sequence[Record], writers: Sequence[RunWriter]
 ) -> None:
     """Raises RunError when parameters are not finite, or nothing of late could be learnt from.
 
     Metrics are kept, the state is not. Vmapped seeds stop together: they resume together, and a
     seed that is lost cannot be saved.
     """
-    reasons = [_why_lost(state, records, seed) for seed in range(len(records))]
+    reasons = [_why_lost(programs, state, records, seed) for seed in range(len(records))]
     lost = next((seed for seed, reason in enumerate(reasons) if reason), None)
     if lost is None:
         return
@@ -209,7 +210,7 @@ def _check_finite(
     )
 
 
-def _why_lost(state: TrainState, records: Sequence[Record], seed: int) -> str:
+def _why_lost(programs: Programs, state: Any, records: Sequence[Record], seed: int) -> str:
     """Returns why the seed of that place cannot go on, "" if it can."""
     record = records[seed]
     if not math.isfinite(record["train/parameter_norm"]):
@@ -217,14 +218,24 @@ def _why_lost(state: TrainState, records: Sequence[Record], seed: int) -> str:
         bad = [k for k, x in params.items() if not np.isfinite(x.astype(np.float64)).all()]
         names = ", ".join(bad) or "their norm overflows"
         return f"Parameters are not finite: {names}. Lower ppo.learning_rate."
-    if math.isnan(record["train/reward"]):
+    skipped, nowhere = record["train/skipped_in_a_row"], math.isnan(record["train/reward"])
+    if not nowhere and skipped < MAX_SKIPPED_IN_A_ROW:
+        return ""
+    whole = programs.fetch(state)
+    part, policy = lost_part(whole.env_state), jax.device_get(programs.policy(whole))
+    loc, scale = _each_seed(policy, len(records))[seed]
+    # Where observations are not sound, the policy cannot be.
+    if not part and not (np.isfinite(loc + scale).all() and np.min(scale) >= LEAST_SCALE):
+        return (
+            f"The policy's loc is {np.min(loc):.3g} to {np.max(loc):.3g}, and its scale "
+            f"{np.min(scale):.3g} to {np.max(scale):.3g}; they must be finite, and scales at least "
+            f"{LEAST_SCALE:g}: let the network keep them so, a scale by jax.nn.softplus(x) + 0.01."
+        )
+    if nowhere:
         return (
             "No step of an update was sound: of each, some number of the state is NaN or absurd, "
-            f"which `purerl.check_env(env)` names. {lost_part(state.env_state)}"
+            f"which `purerl.check_env(env)` names. {part}"
         ).strip()
-    skipped = record["train/skipped_in_a_row"]
-    if skipped < MAX_SKIPPED_IN_A_ROW:
-        return ""
     return (
         f"The last {skipped:.0f} minibatches had a non-finite loss or gradient and were skipped. "
         "Lower ppo.learning_rate or ppo.reward_scale, or mend the environment's reward."
