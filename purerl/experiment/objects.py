@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from purerl.checks.check_env import check_fields, check_members, check_shapes, shapes_of_reset
+from purerl.checks.check_traces import difference, trace_anew
 from purerl.checks.user_code import check_takes, users_errors
 from purerl.core.env import Env, EnvError
 from purerl.core.errors import RunError, UserError, one_line
@@ -16,6 +17,7 @@ from purerl.core.records import Network, PolicyOutput, PyTree
 from purerl.devices import memory, threads
 from purerl.devices.check_sizes import check_minibatches
 from purerl.devices.programs import abstract_state
+from purerl.experiment import settings_json
 from purerl.experiment.definition import Experiment
 from purerl.experiment.kinds import wrong_value
 from purerl.ppo.config import Config
@@ -36,7 +38,7 @@ def build(chosen: Experiment) -> Setup:
     # Imported here, as below: `compare` reads runs, and needs no MuJoCo.
     from purerl.physics.interface import choose_engine
 
-    _check_precision()
+    _check_jax()
     if wrong := wrong_value(chosen):
         raise UserError(f"The experiment's {wrong}")
     check_takes("build_env", chosen.build_env, "options", "engine")
@@ -57,14 +59,49 @@ def build(chosen: Experiment) -> Setup:
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state.observation)
     with users_errors("build_network: "):
         network = chosen.build_network(chosen.network, zeros, env.action_size)
-    setup = Setup(chosen.ppo, env, network, engine)
     with users_errors(""):
         _check_network(network, zeros, env.action_size)
+    setup = Setup(chosen.ppo, env, in_float32(network), engine)
     with users_errors(""), naming_broken_rules(env):
         # Sizes that do not fit together show here, in a second.
         abstract = abstract_state(*setup[:3])
         check_minibatches(setup.config, is_recurrent(abstract.memory), setup.config.num_envs)
     return setup
+
+
+def check_acts(chosen: Experiment, before: dict[str, Any], env: Env, abstract: PyTree) -> None:
+    """Raises UserError for changed settings of a run that goes on, which only its beginning reads.
+
+    They are the seed, which is in the state as a key; the rate that an adaptive schedule starts at;
+    and what leaves a network's `apply` as it was. All of an environment is in every update.
+
+    Args:
+      chosen: the experiment as its run shall go on.
+      before: the settings that the run had, as JSON values.
+      env: the environment.
+      abstract: shapes of the run's state.
+    """
+    seen = abstract.env_state.observation
+    example = jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), seen)
+
+    def trace(settings: Any) -> Any:
+        options = settings_json.from_json(chosen.network, settings)
+        network = chosen.build_network(options, example, env.action_size)
+        return trace_anew(network.apply, abstract.params, seen, abstract.memory)
+
+    now, old = settings_json.to_json(chosen.network), before["network"]
+    idle = ["seed"] * (before["seed"] != chosen.seed)
+    if chosen.ppo.schedule == "adaptive_kl":
+        idle += ["ppo.learning_rate"] * (before["ppo"]["learning_rate"] != chosen.ppo.learning_rate)
+    for name in now if isinstance(now, dict) and isinstance(old, dict) else ():
+        if old.get(name, now[name]) != now[name]:
+            with contextlib.suppress(Exception):  # the code of today refuses what was: it acts
+                if difference(trace(now | {name: old[name]}), trace(now)) is None:
+                    idle.append(f"network.{name}")
+    if idle:
+        raise UserError(
+            f"{', '.join(idle)}: read only when a run begins; give what it was, or another --name."
+        )
 
 
 def check_memory(setup: Setup, abstract: PyTree, seeds: int, devices: int) -> None:
@@ -81,7 +118,9 @@ def check_memory(setup: Setup, abstract: PyTree, seeds: int, devices: int) -> No
         memory.check_room({k: x * seeds // devices for k, x in parts.items()}, memory.room())
 
 
-def _check_precision() -> None:
+def _check_jax() -> None:
+    if jax.config.jax_disable_jit:  # type: ignore[attr-defined]
+        raise UserError("JAX_DISABLE_JIT is on, and a run is compiled programs: unset it.")
     if jax.config.read("jax_enable_x64"):
         raise UserError(
             "JAX_ENABLE_X64 is on, which makes numbers float64; a run computes in float32: unset "
@@ -121,6 +160,8 @@ def _check_network(network: Network, observation: PyTree, action_size: int) -> N
     normal = output.distribution
     answers = [("loc", normal.loc, action), ("scale", normal.scale, action)]
     for name, answer, shape in [*answers, ("value", output.value, scalar)]:
+        if not jnp.issubdtype(answer.dtype, jnp.floating):
+            raise ValueError(f"The network's {name} is {answer.dtype}; it must be float32.")
         if answer.shape != shape:
             raise ValueError(
                 f"The network's {name} is {list(answer.shape)} for 2 observations and "
@@ -132,6 +173,19 @@ def _check_network(network: Network, observation: PyTree, action_size: int) -> N
             f"The network's memory goes in as {kinds[0]} and comes back as {kinds[1]}, for 2 "
             "environments; `apply` must return it as it was given, and `init` one environment's."
         )
+
+
+def in_float32(network: Network) -> Network:
+    """Returns a network whose answers are float32, as all that is computed with them.
+
+    It may compute in half precision; its memory keeps the dtype that it has.
+    """
+
+    def apply(params: PyTree, observation: PyTree, memory: PyTree) -> tuple[PolicyOutput, PyTree]:
+        output, memory = network.apply(params, observation, memory)
+        return jax.tree.map(lambda x: x.astype(jnp.float32), output), memory
+
+    return Network(network.init, apply)
 
 
 def _check_memory_starts_at_zero(network: Network, carry: PyTree) -> None:

@@ -140,10 +140,18 @@ def edited(folder: Folder) -> list[str]:
 
 
 def _check_trains_what_is_new(folder: Folder, config: dict[str, Any], found: list[str]) -> None:
-    """Raises UserError where a run that is done would be given settings that it never had."""
+    """Raises UserError where a run that is done would be given settings that it never had.
+
+    And where an update would have other steps: budget, schedule and evaluations count updates.
+    """
+    old, now = folder.config["settings"]["ppo"], Config(**config["settings"]["ppo"])
+    if (before := old["num_envs"] * old["rollout_length"]) != now.steps_per_update:
+        raise UserError(
+            f"The run {folder.path} counts updates of num_envs * rollout_length = {before} steps, "
+            f"and cannot go on with {now.steps_per_update}: keep both, or use another --name."
+        )
     changed = [line for line in found if line.startswith("settings.")]
-    planned = Config(**config["settings"]["ppo"]).num_updates
-    if changed and max(folder.updates, default=0) >= planned:
+    if changed and max(folder.updates, default=0) >= now.num_updates:
         raise UserError(
             f"The run {folder.path} has all of its updates, so none would be trained with what is "
             "new:\n  " + "\n  ".join(changed) + "\nRaise --ppo.num-steps, or use another --name."

@@ -177,4 +177,6 @@ def _write_down(
     if facts is None:
         return folder
     checkpoint.check_fits(folder.checkpoints, folder.updates, job.abstract)
+    if begun and folder.is_run:
+        objects.check_acts(chosen, folder.config["settings"], job.setup.env, job.abstract)
     return run_folder.write(folder, now.config, facts, source.text)

@@ -65,7 +65,8 @@ def test_a_mistake_is_one_line(place, trained, monkeypatch, request, mistake):
         request.getfixturevalue("opengl")  # `render` opens it before it reads the run
     arrange(mistake.given, place, trained, monkeypatch)
     prepare(place, mistake)
-    with jax.enable_x64(mistake.given == "JAX_ENABLE_X64=1"):
+    x64, no_jit = (mistake.given == f"JAX_{x}=1" for x in ("ENABLE_X64", "DISABLE_JIT"))
+    with jax.enable_x64(x64), jax.disable_jit(no_jit):
         code, said = make(mistake)
     assert code == mistake.code
     assert len(said.splitlines()) == 1 and "Traceback" not in said, said

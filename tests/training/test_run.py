@@ -514,6 +514,8 @@ def test_changes_that_no_checkpoint_fits_leave_the_run_as_it_was(tmp_path, stop_
     start(tmp_path)
     before = [f.read_bytes() for f in sorted(folder(tmp_path).glob("*.json"))]
     words = ["--resume", "--allow-changes", "--ppo.num-envs", "4", "--ppo.num-steps", "400"]
+    assert "32 steps, and cannot go on with 16" in refused(capsys, start(tmp_path, *words))
+    words += ["--ppo.rollout-length", "8"]
     assert "is of another state" in refused(capsys, start(tmp_path, *words))
     assert [f.read_bytes() for f in sorted(folder(tmp_path).glob("*.json"))] == before
 
