@@ -7,6 +7,7 @@ from purerl.training.train import train as train  # a run: the folder and bits o
 from purerl.runs.loaded_run import load as load  # a run read back from its folder
 from purerl.runs.loaded_run import Run as Run  # what these two return
 from purerl.runs.policy import Policy as Policy  # a run's `policy(observation) -> action`
+from purerl.report.video import frames as frames  # a run's policy, drawn
 
 # An experiment.
 from purerl.experiment.definition import Experiment as Experiment  # what is trained, and how

@@ -18,14 +18,14 @@ from purerl.machine.output import show
 
 @dataclass(frozen=True)
 class PlotOptions:
-    """Plots a metric of runs in the terminal, and as a PNG."""
+    """Plots a metric of runs in the terminal, and as a picture."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Runs, folders of runs (runs/ant_run), or patterns ('runs/ant_run/wide*')."""
     metric: str = "eval/episode_return"
     """What to plot, against control steps."""
     out: Path | None = None
-    """Also write a picture (PNG): groups as in compare, their interquartile means, their runs."""
+    """Also write a picture (.png, .pdf, .svg): groups as in compare, their IQMs, their runs."""
 
 
 def command(options: PlotOptions) -> None:
@@ -37,8 +37,8 @@ def command(options: PlotOptions) -> None:
 
     if not options.runs:
         raise UserError("Give the runs to plot: python -m purerl.plot RUN RUN ...")
-    if options.out is not None and options.out.suffix != ".png":
-        raise UserError(f"out is {options.out}; it must end in .png.")
+    if options.out is not None and options.out.suffix not in (".png", ".pdf", ".svg"):
+        raise UserError(f"out is {options.out}; it must end in .png, .pdf or .svg.")
     runs = read_runs(options.runs)
     groups = make_groups(runs, ())
     check_plotted(runs, options.metric)

@@ -19,7 +19,7 @@ class RenderOptions(PlayOptions):
     """Makes a video (mp4) and a contact sheet (PNG) of a run's policy, in RUN/videos/."""
 
     camera: str = ""
-    """A camera's name in the model; by default one that follows the body."""
+    """A camera's name or number in the model; by default one that follows the body."""
     episodes: int = 1
     """Episodes, one after the other."""
     seconds: float = 10.0

@@ -1,8 +1,9 @@
 """Options of commands: how a run is made, kept and shown, and how its policy is played."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, TypedDict
+from typing import Annotated, Any, Literal, TypedDict
 
 import tyro
 
@@ -109,7 +110,8 @@ class TrainOptions(TypedDict, total=False):
     """`RunOptions` as keyword arguments of `train`, for type checkers; a test compares the two.
 
     `num_seeds` is not among them, for `train` returns another type with it; nor is `video`, which
-    is the command's alone. `seed` and `engine` are settings that every experiment has.
+    is the command's alone. `seed` and `engine` are settings that every experiment has, and
+    `on_metrics` is of Python alone.
     """
 
     seed: int
@@ -130,3 +132,4 @@ class TrainOptions(TypedDict, total=False):
     wandb: Literal["off", "online", "offline"]
     wandb_project: str
     cache: bool
+    on_metrics: Callable[[dict[str, Any]], Any]

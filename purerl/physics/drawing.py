@@ -18,8 +18,9 @@ import mujoco
 import numpy as np
 
 from purerl.core.env import State
+from purerl.core.errors import unknown_name
 from purerl.core.records import Array
-from purerl.physics.lookup import find, names
+from purerl.physics.lookup import names
 
 
 class Picture(NamedTuple):
@@ -50,7 +51,7 @@ class Stage:
         # own place, so that a changed one would not show.
         model.geom_sameframe[:] = model.site_sameframe[:] = model.body_sameframe[:] = 0
         self.data = mujoco.MjData(model)
-        self.fixed = find(model, "camera", camera) if camera else default_camera(model)
+        self.fixed = find_camera(model, camera) if camera else default_camera(model)
         self.camera = mujoco.MjvCamera()
         self.root = root_body(model)
         self.followed_height: float | None = None
@@ -107,6 +108,15 @@ def add_scenery(scene: mujoco.MjvScene, scenery: tuple[Array, ...]) -> None:
         color, upright = np.array([0.4, 0.45, 0.5, 1.0], np.float32), np.eye(3).ravel()
         mujoco.mjv_initGeom(geom, box, size, np.asarray(center, float), upright, color)
         scene.ngeom += 1
+
+
+def find_camera(model: mujoco.MjModel, camera: str) -> int:
+    """Returns the id of a camera by its name or its number; ValueError if there is none."""
+    numbers = {str(i): i for i in range(model.ncam)}
+    known = numbers | {name: i for i, name in enumerate(names(model, "camera")) if name}
+    if camera not in known:
+        raise ValueError(unknown_name("camera", camera, known))
+    return known[camera]
 
 
 def default_camera(model: mujoco.MjModel) -> int | None:

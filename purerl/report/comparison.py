@@ -214,7 +214,8 @@ def plotter() -> Any:
     import matplotlib  # most of a second
 
     matplotlib.use("Agg")
-    matplotlib.rcParams["text.parse_math"] = False  # labels have settings in them, any text
+    # Labels have settings in them, any text; and text in a PDF stays text, as journals ask.
+    matplotlib.rcParams.update({"text.parse_math": False, "pdf.fonttype": 42})
     from matplotlib import pyplot
 
     pyplot.style.use("tableau-colorblind10")

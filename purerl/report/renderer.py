@@ -31,8 +31,8 @@ class Renderer(contextlib.AbstractContextManager):
     def __init__(self, model: mujoco.MjModel, width: int, height: int, camera: str = "") -> None:
         """Prepares a copy of a model to be drawn, in frames of width x height [pixels].
 
-        Without a `camera`'s name: the one that shows the body best. RunError if there is no OpenGL;
-        ValueError if there is no such camera.
+        `camera` is its name or number; "": the one that shows the body best. RunError if there is
+        no OpenGL; ValueError if there is no such camera.
         """
         self.stage = Stage(model, camera)
         model = self.stage.model

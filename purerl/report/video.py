@@ -12,6 +12,7 @@ from PIL import Image
 
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.keys import Purpose, derive
+from purerl.experiment.options import check_seed
 from purerl.machine.files import check_inside
 from purerl.report import run_reader
 from purerl.report.episode_pictures import Recording, episode_pictures, frame_stride, record
@@ -19,18 +20,19 @@ from purerl.report.page_series import RETURN
 from purerl.report.renderer import Renderer, model_of
 from purerl.runs.loaded_run import Run
 
+Size = tuple[int, int]  # width and height [pixels]
 SHEET = 4  # rows and columns of the contact sheet
 SHEET_WIDTH = 320  # of each of its images [pixels]
 
 
 def make_video(
-    run: Run, camera: str, episodes: int, seconds: float, size: tuple[int, int], seed: int
+    run: Run, camera: str, episodes: int, seconds: float, size: Size, seed: int
 ) -> tuple[Path, list[str]]:
     """Plays episodes by the deterministic policy, and writes a video and a contact sheet of them.
 
     Args:
       run: the run; the files go to its folder's videos/.
-      camera: a camera's name in the model; "": one that follows the body.
+      camera: a camera's name or number in the model; "": one that follows the body.
       episodes: how many, one after the other.
       seconds: at most so much of each [s].
       size: width and height of a frame [pixels].
@@ -60,6 +62,35 @@ def make_video(
     with contextlib.suppress(UserError):  # metrics that cannot be read spoil no video
         lines += beside_evaluation(run_reader.read(run.folder).lines, run.update, whole)
     return path, lines
+
+
+def frames(
+    run: Run, camera: str | int = "", seconds: float = 10.0, size: Size = (320, 240), seed: int = 0
+) -> tuple[np.ndarray, float]:
+    """Plays an episode by the deterministic policy, and draws it, without a screen or a file.
+
+    Args:
+      run: the run, as `load` and `train` return it.
+      camera: a camera's name or number in the model; "": one that follows the body.
+      seconds: at most so much of the episode [s].
+      size: width and height of a frame [pixels].
+      seed: of the episode.
+
+    Returns:
+      Pictures [F, height, width, 3] uint8, and how many of them make a second.
+
+    Raises:
+      UserError: the environment cannot be drawn, or an argument is out of its range.
+      RunError: there is no OpenGL; the message says what to install.
+    """
+    check_seed(seed)
+    if not (seconds >= 0.1 and 16 <= min(size) <= max(size) <= 4096):
+        raise UserError(f"seconds is {seconds}, size {size}: at least 0.1, and 16 to 4096 pixels.")
+    timestep = run.env.control_timestep
+    stride = frame_stride(timestep)
+    with renderer_of(run.env, size, str(camera)) as renderer:
+        pictures = episode_pictures(_play(run, 1, seconds, seed), 0, stride)
+        return np.stack(list(renderer.draw_episode(pictures))), 1.0 / (stride * timestep)
 
 
 def videos_of(folder: Path) -> Path:

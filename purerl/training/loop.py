@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from purerl.checks.check_env import lost_part
+from purerl.checks.user_code import users_errors
 from purerl.core.errors import RunError, StoppedError
 from purerl.core.records import Metrics, PyTree, TrainState, count_as_int
 from purerl.devices.programs import Programs
@@ -36,6 +37,7 @@ def train(
     stop: Callable[[], bool],
     meta: Record,
     best: Sequence[float],
+    listener: Callable[[Record], Any] | None = None,
 ) -> None:
     """Runs from `state` to the end of the plan, or to a requested stop.
 
@@ -50,8 +52,10 @@ def train(
         earlier lives of the run took.
       best: each seed's highest evaluation return so far, -inf without one. What is better is saved,
         so that the best evaluation has a checkpoint.
+      listener: a user's function that is called with each chunk's record, as it is shown.
 
     Raises:
+      UserError: what `listener` raised.
       StoppedError: stopped on request, saved.
       RunError: the numbers are no longer finite, or the last checkpoint could not be saved.
     """
@@ -85,7 +89,10 @@ def train(
         best = better
         rate = (update - first) / (time.perf_counter() - begin)
         left = (plan.updates - update) / rate
-        progress.show(shown_record(records), left, rate * plan.steps_per_update * number)
+        progress.show(shown := shown_record(records), left, rate * plan.steps_per_update * number)
+        if listener:
+            with users_errors("on_metrics: "):
+                listener(shown)
     for writer in writers:
         writer.finish()
     if update < plan.updates:

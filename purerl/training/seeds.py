@@ -58,6 +58,7 @@ class Job(NamedTuple):
     plan: Plan
     facts: dict[str, Any]  # what manifest.json says of a run that begins now
     stop: Callable[[], bool]  # tells whether a signal asked to stop
+    listener: Callable[[Record], Any] | None = None  # called with each line of metrics
 
 
 class Seed(NamedTuple):
@@ -139,7 +140,7 @@ def _train_together(job: Job, seeds: list[Seed], programs: Callable[[], Programs
         stop = processes.agreed(job.stop)
         with program_errors():
             state = compiled.spread(state)
-            loop.train(job.plan, compiled, state, writers, progress, stop, meta, best)
+            loop.train(job.plan, compiled, state, writers, progress, stop, meta, best, job.listener)
         for seed, writer in zip(seeds, writers, strict=True):
             of = f" of {seed.path.name}" if job.options.num_seeds > 1 else ""
             say(f"Done: {job.plan.steps:,} steps{of}. Digest {writer.digest}")

@@ -44,6 +44,7 @@ def execute(
     found: Sequence[Folder],
     options: RunOptions,
     stop: Callable[[], bool],
+    listener: Any = None,
 ) -> None:
     """Prepares the folders and the programs, and trains.
 
@@ -53,6 +54,7 @@ def execute(
       found: what each folder held when the command began.
       options: the run's options.
       stop: tells whether a signal asked to stop.
+      listener: called with each line of metrics, or None.
     """
     with processes.fail_together(), ExitStack() as stack:
         processes.start(options.distributed)
@@ -60,7 +62,7 @@ def execute(
         in_first_process(lambda: resume.check_new_or_resume(found, experiments, options.resume))
         check_loggers(options)
         cache = compilation.set_up_jax(options.cache)
-        job = prepare(source, experiments[0], found, options, stop)
+        job = prepare(source, experiments[0], found, options, stop)._replace(listener=listener)
         seeds = begin(source, runs, job, cache, stack)
         train_all(job, seeds)
 

@@ -55,7 +55,9 @@ def train(
     Args:
       experiment: a name in experiments/, the path of a Python file, or a dotted module.
       settings: dotted names of settings and their values, checked as on the command line.
-      options: the run command's options: name, resume, num_seeds, runs, checkpoints, ...
+      options: the run command's options: name, resume, num_seeds, runs, checkpoints, ... And
+        `on_metrics`, which is called with each line of metrics.jsonl, a dict, when it is written;
+        of vmapped seeds with the first one's line, whose train/episode_return is all seeds' mean.
 
     Returns:
       The run; where `num_seeds` is given, a list of them, also of one.
@@ -77,16 +79,17 @@ def train(
             "it into a .py file and give train that file's path. Change its settings by settings=."
         )
     set_xla_flags_in_time()
+    listener = options.pop("on_metrics", None)
     source = find_source(str(experiment))
     chosen, how = from_settings(source, settings or {}, options)
     if how.video:
         raise UserError("video is an option of the command; call `python -m purerl.render RUN`.")
-    runs = [Run(folder, trust=True) for folder in train_runs(source, chosen, how, _interrupt)]
+    runs = [Run(path, trust=True) for path in train_runs(source, chosen, how, _raise, listener)]
     return runs if "num_seeds" in options else runs[0]
 
 
 def train_runs(
-    source: Source, chosen: Experiment, options: RunOptions, end: Callable[[int], Any]
+    source: Source, chosen: Experiment, options: RunOptions, end: Callable, listener: Any = None
 ) -> list[Path]:
     """Trains an experiment of every seed; returns their folders.
 
@@ -95,6 +98,7 @@ def train_runs(
       chosen: the experiment with its overrides.
       options: the run's options.
       end: called with an exit code at the second signal.
+      listener: called with each line of metrics, or None.
     """
     from purerl.runs import folder, manifest
     from purerl.training.session import execute
@@ -110,7 +114,7 @@ def train_runs(
         set_portable_flags_in_time()
     threads.leave_one(chosen.engine)
     with stop_signals(end) as stop:
-        execute(source, runs, found, options, stop)
+        execute(source, runs, found, options, stop, listener)
     return list(runs)
 
 
@@ -169,5 +173,5 @@ def _runs_on_gpu() -> bool:
     return threads.jax_has_begun() and sys.modules["jax"].default_backend() == "gpu"
 
 
-def _interrupt(code: int) -> None:
+def _raise(code: int) -> None:
     raise KeyboardInterrupt

@@ -259,7 +259,7 @@ def test_flags_that_come_too_late_for_a_gpu_are_not_claimed(monkeypatch, capsys,
 
 def test_a_second_signal_interrupts_and_the_handlers_come_back(capsys):
     before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt), train.stop_signals(train._interrupt) as stop:
+    with pytest.raises(KeyboardInterrupt), train.stop_signals(train._raise) as stop:
         os.kill(os.getpid(), signal.SIGTERM)
         assert stop()
         os.kill(os.getpid(), signal.SIGTERM)
