@@ -12,8 +12,8 @@ from purerl.machine.command_errors import leave, tell
 from purerl.machine.output import show
 
 COMMANDS = (
-    "new", "check", "run", "evaluate", "render", "view", "record", "export", "compare", "report",
-    "plot", "sweep", "plan",
+    "new", "check", "run", "evaluate", "render", "view", "record", "export", "pack", "compare",
+    "report", "plot", "sweep", "plan",
 )  # fmt: skip
 
 HERE = Path(__file__).parent

@@ -56,7 +56,7 @@ def _train(words: Sequence[str]) -> None:
     from purerl.training import train
 
     train.set_xla_flags_in_time()
-    source, chosen, options = read_experiment(words, "python -m purerl.run")
+    source, chosen, options = read_experiment(words, "python -m purerl.run", choose=train.as_begun)
     # Before mujoco is imported, which looks for OpenGL itself.
     video = options.video and _attempt("video", choose_gl)
     folders = train.train_runs(source, chosen, options, os._exit)

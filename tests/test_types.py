@@ -73,6 +73,7 @@ reveal_type(run)  # Run
 reveal_type(purerl.train("mine.py", num_seeds=3, seeds_by="map"))  # list[Run]
 reveal_type(purerl.load("runs/mine/a"))  # Run
 purerl.train("mine.py", nmae="a")  # wrong
+purerl.train("mine.py", resume="auto")
 purerl.train("mine.py", resume="yes")  # wrong
 purerl.train("mine.py", seeds_by="pmap")  # wrong
 purerl.train("mine.py", num_seeds=3).update  # wrong

@@ -22,6 +22,8 @@ from purerl.machine.command_errors import tell
 CONFIG = (tyro.conf.FlagCreatePairsOff,)
 # A flag takes a word, True or False, as every other option does.
 WORDS = (tyro.conf.FlagConversionOff,)
+# Gives back an experiment with the overrides of a command line, and the command's options.
+Over = Callable[..., tuple[Experiment, Any]]
 
 
 def main_of(kind: Any, command: Callable[[Any], int | None], prog: str) -> Callable[..., int]:
@@ -66,7 +68,7 @@ def _main(run: Callable[[list[str]], int | None]) -> Callable[..., int]:
 
 
 def read_experiment(
-    words: Sequence[str], prog: str, base: Any = RunOptions
+    words: Sequence[str], prog: str, base: Any = RunOptions, **more: Any
 ) -> tuple[Source, Experiment, Any]:
     """Returns the experiment that the first word names, and what the others make of it.
 
@@ -74,6 +76,7 @@ def read_experiment(
       words: the command line.
       prog: the command before it.
       base: the dataclass of the command's options.
+      more: for `from_command_line`.
 
     Raises:
       UserError: there is no such experiment or option, or a value is wrong.
@@ -84,7 +87,7 @@ def read_experiment(
             "[--option value ...]"
         )
     source = find_source(words[0])
-    return source, *from_command_line(source, words[1:], f"{prog} {words[0]}", base=base)
+    return source, *from_command_line(source, words[1:], f"{prog} {words[0]}", base=base, **more)
 
 
 def from_command_line(
@@ -94,6 +97,7 @@ def from_command_line(
     config: Any = CONFIG,
     base: Any = RunOptions,
     names: Sequence[str] = (),
+    choose: Callable[[Source, Over], tuple[Experiment, Any]] | None = None,
 ) -> tuple[Experiment, Any]:
     """Returns the experiment with its overrides, and the command's options.
 
@@ -104,12 +108,13 @@ def from_command_line(
       config: tyro's markers.
       base: the dataclass of the command's options.
       names: of the experiment's settings that can be overridden; none: all.
+      choose: says over what, where that is not what the experiment's file has.
 
     Raises:
       UserError: there is no such option, or a value is wrong.
     """
 
-    def over(experiment: Experiment) -> tuple[Experiment, Any]:
+    def over(experiment: Experiment, **more: Any) -> tuple[Experiment, Any]:
         values = settings_json.settings_of(experiment)
         values = {name: values[name] for name in names or values}
         kinds = {f.name: f.type for f in dataclasses.fields(Experiment)}
@@ -119,19 +124,19 @@ def from_command_line(
         fields = [(name, kinds[name], dataclasses.field(kw_only=True)) for name in values]
         both = dataclasses.make_dataclass("Settings", fields, bases=(base,), frozen=True)
         both.__doc__ = summary(source.path) or f"Trains {source.name}."
-        parsed = parse(both, arguments, prog, both(**values), config)
+        parsed = parse(both, arguments, prog, both(**values, **more), config)
         overrides = {name: getattr(parsed, name) for name in values}
         options = {f.name: getattr(parsed, f.name) for f in dataclasses.fields(base)}
         return dataclasses.replace(experiment, **overrides), base(**options)
 
-    chosen, options = over(source.experiment)
+    chosen, options = choose(source, over) if choose else over(source.experiment)
     # Tiny sizes, but for those that were given.
     debug = getattr(options, "debug", False)
     return over(shrunk(source.experiment)) if debug else (chosen, options)
 
 
 def from_settings(
-    source: Source, settings: Mapping[str, Any], options: Mapping[str, Any]
+    source: Source, settings: Mapping[str, Any], options: Mapping[str, Any], **more: Any
 ) -> tuple[Experiment, RunOptions]:
     """Returns the same as `from_command_line`, checked in the same way, from Python values.
 
@@ -139,6 +144,7 @@ def from_settings(
       source: the experiment.
       settings: "ppo.num_envs" -> value.
       options: "num_seeds" -> value.
+      more: for `from_command_line`.
     """
     if not isinstance(settings, Mapping):
         raise UserError(f"settings is {settings!r}; give a dict, such as {{'ppo.gamma': 0.99}}.")
@@ -149,7 +155,7 @@ def from_settings(
             raise UserError(f"Settings of {name} have dotted names: give {dotted}.")
     words = [word for pair in {**settings, **options}.items() for word in _words(*pair)]
     known = source.name if source.name in available() else source.path
-    return from_command_line(source, words, f"python -m purerl.run {known}", WORDS)
+    return from_command_line(source, words, f"python -m purerl.run {known}", WORDS, **more)
 
 
 def _words(name: str, value: Any) -> list[str]:
@@ -233,7 +239,7 @@ _IN_WORDS: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"^invalid choice (.*) for argument '(\S+)'.*\((.*)\)", _wrong_choice),
     (r"^Missing from .*?: [A-Z.,\[\]{} ]+?(?=[A-Z][a-z'])", "The command lacks: "),
     (r" \(required\)", ""),
-    (r"^Error parsing \w+: ", ""),  # a rule of a dataclass, in its own words
+    (r"^Error parsing [\w-]+: ", ""),  # a rule of a dataclass, in its own words
 )
 
 

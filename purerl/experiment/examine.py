@@ -1,5 +1,7 @@
 """All checks of an experiment, one after another: its sizes, environment and network, its speed."""
 
+import dataclasses
+import math
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -23,6 +25,8 @@ from purerl.ppo.learner import is_recurrent
 FEW_SAMPLES = 32  # in a minibatch, whose gradient is then mostly noise
 FEW_UPDATES = 50  # of a run: a cart-pole had 335 of 1000 after 48, and 901 after 122
 OBSERVATIONS = 256  # that a network is tried on, at most
+LONGEST = 40.0  # [s] in which it is timed, without compiling
+ROLLOUTS = 9  # in that: three alone, three updates, in which learning takes as long as acting
 SHARE = 0.5  # of the memory: what the estimate leaves out may be as much again
 
 
@@ -111,18 +115,25 @@ def _speeds(setup: Setup, start: State) -> Iterator[Finding]:
     shape = (config.num_envs, env.action_size)
 
     @jax.jit
-    def steps(state: State, key: Any) -> State:
-        def one(state: State, key: Any) -> tuple[State, None]:
-            action = jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
-            return jax.vmap(env.step)(state, action), None
+    def steps(state: State, number: int) -> State:
+        def one(i: Any, state: State) -> State:
+            return jax.vmap(env.step)(state, jax.random.uniform(jax.random.key(i), shape) * 2 - 1)
 
-        return jax.lax.scan(one, state, jax.random.split(key, config.rollout_length))[0]
+        return jax.lax.fori_loop(0, number, one, state)
 
-    alone = _seconds(lambda: steps(start, jax.random.key(0)))
+    step = _seconds(lambda: steps(start, 1))
+    length = timed_steps(config, step)
+    what = (
+        f"a control step of {config.num_envs} environments takes {step:.2g} s, so timing {length}"
+    )
+    yield ok("speed", f"{what} takes about {ROLLOUTS * length * step:.0f} s, and compiling")
+    alone = _seconds(lambda: steps(start, length)) / length
+    yield ok("speed", f"{config.num_envs / alone:,.0f} steps/s of the environments alone")
     number = config.steps_per_update
+    short = setup._replace(config=dataclasses.replace(config, rollout_length=length))
     with naming_broken_rules(env):
         programs = compile_programs(
-            *setup[:3], Evaluation(number=0), True, Shards(), calls_host=setup.engine == "c"
+            *short[:3], Evaluation(number=0), True, Shards(), calls_host=setup.engine == "c"
         )
     states = [programs.init(jax.random.key(0))]
 
@@ -130,14 +141,25 @@ def _speeds(setup: Setup, start: State) -> Iterator[Finding]:
         states[0], metrics = programs.update(states[0])
         return metrics
 
-    whole = _seconds(update)
-    yield ok("speed", f"{number / alone:,.0f} steps/s of {config.num_envs} environments alone")
+    whole = _seconds(update) * config.rollout_length / length
     left = config.num_updates * whole
     yield ok(
         "speed",
         f"{number / whole:,.0f} steps/s in an update of {whole:.2f} s: {config.num_updates:,} "
         f"updates take {left / 60:,.1f} min, without evaluations",
     )
+
+
+def timed_steps(config: Config, seconds: float) -> int:
+    """Returns how many control steps an update has that is timed: all, where LONGEST is enough.
+
+    Args:
+      config: the run's settings.
+      seconds: that a control step of all environments takes.
+    """
+    least = config.num_minibatches // math.gcd(config.num_minibatches, config.num_envs)
+    most = int(LONGEST / (ROLLOUTS * seconds)) // least * least
+    return min(config.rollout_length, max(least, most))
 
 
 def _seconds(function: Callable[[], Any]) -> float:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypedDict
 
 import tyro
+from tyro.constructors import PrimitiveConstructorSpec
 
 from purerl.core.errors import UserError, check_least
 
@@ -16,6 +17,19 @@ def check_seed(seed: int) -> None:
     """Raises UserError for a seed that JAX would take for another one: it keeps 32 bits."""
     if not 0 <= seed < 2**32:
         raise UserError(f"seed is {seed}; it must be at least 0 and below 2**32.")
+
+
+def read_resume(words: list[str]) -> bool | Literal["auto"]:
+    """Returns what the words behind `--resume` mean: none, auto, or Python's True and False."""
+    if words not in ([], ["auto"], ["True"], ["False"]):
+        raise ValueError(f"resume is {' '.join(words)!r}; write --resume, or --resume auto.")
+    return "auto" if words == ["auto"] else words != ["False"]
+
+
+Resume = bool | Literal["auto"]
+RESUME = PrimitiveConstructorSpec(
+    "*", "[auto]", read_resume, lambda value: value in (True, False, "auto"), lambda value: []
+)
 
 
 @dataclass(frozen=True)
@@ -57,8 +71,9 @@ class RunOptions:
     HOST:PORT,NUM_PROCESSES,PROCESS_ID, HOST being that of process 0, which alone writes the run."""
     portable: bool = False
     """On a CPU: the same bits on every x86-64 processor with AVX2, at some cost in speed."""
-    resume: bool = False
-    """Go on from the last whole checkpoint of the run."""
+    resume: Annotated[Resume, RESUME] = False
+    """Go on from the last whole checkpoint of the run, with its settings where none is given; auto:
+    begin the run if there is none, so that one script does both."""
     allow_changes: bool = False
     """Resume although settings, versions or device differ; written down in manifest.json."""
     runs: Path = Path("runs")
@@ -89,7 +104,7 @@ class RunOptions:
         """Checks the rules."""
         least = {"num_seeds": 1, "num_shards": 0, "log_every": 0, "checkpoints": 0, "keep": 1}
         check_least(self, ValueError, **least)
-        if self.debug and self.resume:
+        if self.debug and self.resume is True:
             raise ValueError("A debug run is made anew: leave out --resume, or --debug.")
 
     @property
@@ -121,7 +136,7 @@ class TrainOptions(TypedDict, total=False):
     num_shards: int
     distributed: str
     portable: bool
-    resume: bool
+    resume: Resume
     allow_changes: bool
     runs: str | Path
     debug: bool

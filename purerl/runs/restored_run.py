@@ -49,7 +49,7 @@ def restore(
     """
     run = read_run(Path(folder))
     begun = check_manifest(run)
-    original = Path(begun["experiment_file"])
+    original = Path(begun["experiment_file"]).absolute()
     source = load_copy(run.path / CODE, run.code, run.config["experiment"], original, trust)
     settings = _fill(run.config["settings"], settings_json.to_json(source.experiment), say)
     chosen = settings_json.from_json(

@@ -12,6 +12,7 @@ from purerl.core.errors import UserError
 from purerl.experiment import settings_json
 from purerl.experiment.definition import Experiment
 from purerl.experiment.loading import Source
+from purerl.experiment.options import Resume
 from purerl.experiment.source_hashes import hash_code
 from purerl.machine.files import draft_of
 from purerl.ppo.config import Config
@@ -33,23 +34,23 @@ class Description(NamedTuple):
 
 
 def check_new_or_resume(
-    folders: Sequence[Folder], experiments: Sequence[Experiment], resume: bool
+    folders: Sequence[Folder], experiments: Sequence[Experiment], resume: Resume
 ) -> None:
     """Raises UserError if a new run would overwrite something, or there is nothing to resume.
 
     Args:
       folders: of each seed. Seeds that were killed while starting may have only some of them.
       experiments: of each seed.
-      resume: whether the runs are to go on.
+      resume: whether the runs are to go on; auto: those that there are.
     """
-    if resume and not any(folder.exists for folder in folders):
+    if resume is True and not any(folder.exists for folder in folders):
         where = folders[0].path
         raise UserError(f"There is no run {where} to resume; leave out --resume to start it.")
     for folder, chosen in zip(folders, experiments, strict=True):
         _check_usable(folder, chosen, resume)
 
 
-def _check_usable(folder: Folder, chosen: Experiment, resume: bool) -> None:
+def _check_usable(folder: Folder, chosen: Experiment, resume: Resume) -> None:
     """Raises UserError if one folder may not be written."""
     for name in sorted(folder.links):
         path = folder.path / name
@@ -172,24 +173,11 @@ def cure(found: list[str]) -> str:
         return "Put back what was edited"
     if all(line.startswith("model: ") for line in found):  # no setting and no code has made it so
         return "Put back what was edited of the MuJoCo model, the MJCF or a file that it reads"
-    given = "Give the command it was begun with" + _options(found)
+    of_command = any(line.startswith(("settings.", "schedule.")) for line in found)
+    given = "Leave out what differs" if of_command else "Give the command it was begun with"
     if any(line.startswith("settings.ppo.num_steps") for line in found):
         return f"{given}; to train longer, copy the run first (docs/howto/go_on.md)"
     return given
-
-
-def _options(found: list[str]) -> str:
-    """Returns the options that bring settings back that differ, as a clause; "" if there is none.
-
-    >>> _options(["settings.ppo.num_steps: 300000 -> 500000", "versions.jax: 1 -> 2"])
-    ', which has --ppo.num-steps 300000'
-    """
-    lines = [line.removeprefix("settings.") for line in found if line.startswith("settings.")]
-    parts = [line.partition(" -> ")[0].split(": ", 1) for line in lines]
-    words = [
-        f"--{name.replace('_', '-')} {value.strip('[]').replace(',', '')}" for name, value in parts
-    ]
-    return f", which has {' '.join(words)}" if words else ""
 
 
 def _shortened(found: list[str]) -> list[str]:

@@ -159,7 +159,7 @@ def _newest(job: Job, seeds: list[Seed], say: Say) -> list[checkpoint.Saved]:
     if not saved:
         promised = any(one.get("had_checkpoint") for one in facts)
         checkpoint_folder.check_none_lost(places, promised)
-        if job.options.resume:
+        if job.options.resume is True:
             say(f"There is no checkpoint in {places[0]}: it begins anew.")
     return saved
 

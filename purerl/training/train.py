@@ -3,6 +3,7 @@
 Nothing here imports JAX before a run begins, so that XLA's flags are set in time.
 """
 
+import contextlib
 import dataclasses
 import os
 import platform
@@ -15,13 +16,15 @@ from typing import Any, Unpack, overload
 from purerl.core.errors import UserError
 from purerl.devices import threads
 from purerl.exact import xla_flags
-from purerl.experiment.command_line import from_settings
+from purerl.experiment import settings_json
+from purerl.experiment.command_line import Over, from_settings
 from purerl.experiment.definition import Experiment
 from purerl.experiment.loading import Source, find_source
 from purerl.experiment.options import RunOptions, TrainOptions, check_seed
+from purerl.experiment.source_hashes import hash_code
 from purerl.experiment.trust import remember
 from purerl.machine import output
-from purerl.machine.files import check_name
+from purerl.machine.files import check_name, check_object, read_bytes, read_json
 from purerl.machine.signals import stop_signals
 from purerl.runs.loaded_run import Run
 
@@ -81,7 +84,7 @@ def train(
     set_xla_flags_in_time()
     listener = options.pop("on_metrics", None)
     source = find_source(str(experiment))
-    chosen, how = from_settings(source, settings or {}, options)
+    chosen, how = from_settings(source, settings or {}, options, choose=as_begun)
     if how.video:
         raise UserError("video is an option of the command; call `python -m purerl.render RUN`.")
     runs = [Run(path, trust=True) for path in train_runs(source, chosen, how, _raise, listener)]
@@ -116,6 +119,33 @@ def train_runs(
     with stop_signals(end) as stop:
         execute(source, runs, found, options, stop, listener)
     return list(runs)
+
+
+def as_begun(source: Source, over: Over) -> tuple[Experiment, RunOptions]:
+    """Returns what a command line makes of the settings that a run which goes on was begun with.
+
+    So what the command leaves out stays as it is. Where the experiment's file has been edited since
+    then, or there is no such run, the file's own settings count.
+
+    Args:
+      source: the experiment.
+      over: returns an experiment, and options by name, with what the command line has instead.
+    """
+    from purerl.runs import folder, manifest
+
+    known = chosen, options = over(source.experiment)
+    if not options.resume or options.debug:
+        return known
+    place = next(iter(_folders(source, chosen, options)))
+    with contextlib.suppress(UserError):  # told where the folder is read as a run's
+        if hash_code(read_bytes(place / folder.CODE)) == hash_code(source.text):
+            begun = read_json(place / folder.CONFIG, settings=dict, schedule=dict)
+            schedule = check_object("", begun["schedule"], log_every=int, checkpoints=int)
+            both = {name: schedule[name] for name in ("log_every", "checkpoints")}
+            known = over(settings_json.from_json(source.experiment, begun["settings"]), **both)
+    if unlike := manifest.differences(*map(settings_json.to_json, (chosen, known[0]))):
+        output.say(f"settings     as the run was begun: {', '.join(unlike)}")
+    return known
 
 
 def _folders(source: Source, chosen: Experiment, options: RunOptions) -> dict[Path, Experiment]:

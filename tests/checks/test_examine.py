@@ -199,12 +199,13 @@ def test_a_run_of_few_updates_and_a_setting_that_nothing_reads_are_named():
 
 def test_speed_is_measured_only_when_asked(monkeypatch):
     """By a clock of its own: what a busy machine measures says nothing of the code."""
-    took = iter([0.5, 2.0])  # a rollout of 32 steps alone, and an update of as many
+    took = iter([0.01, 0.5, 2.0])  # a step of each, a rollout of 32 steps, an update of as many
     monkeypatch.setattr(examine, "_seconds", lambda function: (function(), next(took))[1])
     quick, timed = (list(examine.examine(experiment, speed)) for speed in (False, True))
     assert timed[: len(quick)] == quick
-    alone, update = (one.text for one in timed[len(quick) :])
-    assert alone == "64 steps/s of 8 environments alone"
+    told, alone, update = (one.text for one in timed[len(quick) :])
+    assert told.endswith("takes 0.01 s, so timing 4 takes about 0 s, and compiling")
+    assert alone == "64 steps/s of the environments alone"
     assert update.startswith("16 steps/s in an update of 2.00 s: 12 updates take 0.4 min")
 
 
@@ -417,3 +418,14 @@ def test_a_memory_that_never_changes():
 
     found = bad(examine_network.examine(Network(init, forgetful), OBSERVATION))
     assert "never changes" in found["memory"]
+
+
+@pytest.mark.parametrize(
+    ("minibatches", "seconds", "steps"),
+    [(8, 0.01, 20), (8, 1.0, 4), (8, 100.0, 1), (12, 1.0, 3), (12, 0.7, 6), (12, 100.0, 3)],
+)
+def test_an_update_is_timed_of_no_more_steps_than_time_allows(minibatches, seconds, steps):
+    """8 environments; 12 minibatches have whole ones of each three steps."""
+    length = 20 if minibatches == 8 else 21
+    config = Config(num_envs=8, rollout_length=length, num_minibatches=minibatches)
+    assert examine.timed_steps(config, seconds) == steps

@@ -32,7 +32,10 @@ OTHERS = (*DECOYS, "docs", "benchmarks", "peers")  # what a clone has, and nobod
 FEW = "--ppo.num-steps 32768 --evaluation.number 1 --evaluation.num-episodes 4"
 FEW_OF_NEW = "--ppo.num-steps 8192 --evaluation.number 1 --evaluation.num-episodes 4"
 ENOUGH = 930.0  # return of 1000
-BODIES = ("assets/cartpole.xml", "experiment/templates/body.xml")
+BODIES = (
+    "assets/cartpole.xml",
+    *(f"experiment/templates/{x}" for x in ("body.xml", "train.sbatch")),
+)
 TOP_LEVEL = """
 import importlib.metadata, json, pathlib, site
 (packages,) = site.getsitepackages()

@@ -46,12 +46,15 @@ def reads(words: list[str]) -> dict[str, int]:
     return eval(done.stdout.splitlines()[-1])
 
 
-def test_a_resume_reads_each_file_twice_before_its_lock_and_after(trained):
-    """5 s. The last checkpoint is taken away, so that the run goes on and writes."""
+def test_a_resume_reads_the_manifest_twice_before_its_lock_and_after(trained):
+    """5 s. The others once more, for settings that a command leaves out.
+
+    The last checkpoint is taken away, so that the run goes on and writes.
+    """
     last = sorted((trained / "checkpoints").iterdir())[-1]
     last.rename(trained.parent.parent / last.name)
     found = reads([str(TOY), "--runs", str(trained.parent.parent), "--resume"])
-    assert found == dict.fromkeys(FILES, 2)
+    assert found == dict.fromkeys(FILES, 3) | {run_folder.MANIFEST: 2}
     assert (trained / "checkpoints" / last.name).is_dir()
 
 

@@ -174,16 +174,9 @@ def test_a_run_on_c_imports_no_other_engine():
         (["settings.ppo.gamma: 0.99 -> 0.9", resume.EDITED], "Put the file back"),
         (["vmapped_seeds: {'first': 1, 'number': 3} -> (absent)"], "--num-seeds and --seed"),
         (["schedule.log_every: 1 -> 2", "settings.ppo.num_steps: 9 -> 99"], "go_on.md"),
-        (
-            ["settings.ppo.num_steps: 9 -> 99"],
-            "the command it was begun with, which has --ppo.num-steps 9;",
-        ),
-        (
-            ["settings.network.policy_hidden: [8, 16] -> [8]", "settings.seed: 2 -> 1"],
-            "begun with, which has --network.policy-hidden 8 16 --seed 2",
-        ),
+        (["settings.ppo.num_steps: 9 -> 99"], "Leave out what differs; to train longer, copy"),
         (["model: ab -> cd"], "Put back what was edited of the MuJoCo model"),
-        (["model: ab -> cd", "settings.env.mass: 1.0 -> 2.0"], "which has --env.mass 1.0"),
+        (["model: ab -> cd", "settings.env.mass: 1.0 -> 2.0"], "Leave out what differs"),
         (
             ["source.pk.mine: ab -> (absent)", "source.purerl_experiment_mine: (absent) -> ab"],
             "in the folder it was begun in",

@@ -4,7 +4,6 @@ All state is in the runs' folders and in the logs. Kill this process in any way:
 which runs are done, goes on with those that were interrupted, and waits for those that still train.
 """
 
-import contextlib
 import os
 import signal
 import subprocess
@@ -21,7 +20,7 @@ from purerl.machine.output import printable, warn
 from purerl.machine.signals import handling
 from purerl.report import run_reader
 from purerl.runs import checkpoint_folder
-from purerl.runs.folder import CHECKPOINTS, read
+from purerl.runs.folder import CHECKPOINTS
 
 POLL = 0.2  # [s]
 TAIL = 1 << 16  # [bytes] of a log in which its last line is looked for
@@ -36,7 +35,7 @@ class Job(NamedTuple):
     """One process of `python -m purerl.run`, which may train several seeds."""
 
     name: str
-    words: tuple[str, ...]  # of the command line, without --resume
+    words: tuple[str, ...]  # of the command line, without --resume auto
     folders: tuple[Path, ...]  # of its runs
     log: Path
 
@@ -169,9 +168,7 @@ def start(job: Job, more: Mapping[str, str], before: tuple[str, ...] = ()) -> su
       more: of its environment, besides ours.
       before: words before the command, of a shell that prepares it.
     """
-    words = [*RUN, *job.words]
-    with contextlib.suppress(UserError):  # a broken manifest: the run will say so
-        words += ["--resume"] if any(read(folder).is_begun for folder in job.folders) else []
+    words = [*RUN, *job.words, "--resume", "auto"]
     make_folder(job.log.parent)
     with job.log.open("ab") as log:
         log.write(f"$ python {' '.join(words)}\n".encode())

@@ -3,7 +3,7 @@
 import contextlib
 import hashlib
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -235,17 +235,17 @@ def _submit(sweep: Sweep) -> int:
     options = sweep.options
     names, queued = slurm.submit(jobs, sweep.base.folder, options.slurm, options.jobs)
     say(f"sweep        {sweep.base.folder}: {len(names)} of {len(jobs)} points submitted, "
-        f"{queued} in the queue or training")  # fmt: skip
+        f"{len(queued)} in the queue or training")  # fmt: skip
     if names or queued:
         say("The same command tells how far they are, and submits again what was stopped.")
-    _report(sweep, sweep.points)
-    return SUCCESS
+    rows = _report(sweep, sweep.points, {*names, *queued})
+    return FAILURE if "failed" in {row.status for row in rows} else SUCCESS
 
 
-def _report(sweep: Sweep, chosen: Sequence[Point]) -> list[table.Row]:
+def _report(sweep: Sweep, chosen: Sequence[Point], queued: Container[str] = ()) -> list[table.Row]:
     """Prints the table, and writes it and the picture; returns its rows."""
     metric, folder = sweep.options.metric, sweep.base.folder
-    rows = table.make_rows(sweep.base, chosen, metric)
+    rows = table.make_rows(sweep.base, chosen, metric, queued)
     lines = table.describe(rows, sweep.spaces, metric)
     files = list(table.write(folder, rows, sweep.spaces, lines).values())
     drawn = folder / "sweep.png"

@@ -74,7 +74,9 @@ def check(text: str) -> None:
         )
 
 
-def submit(jobs: Sequence[Job], folder: Path, text: str, at_once: int) -> tuple[list[str], int]:
+def submit(
+    jobs: Sequence[Job], folder: Path, text: str, at_once: int
+) -> tuple[list[str], list[str]]:
     """Submits the jobs that are neither done nor in the queue.
 
     Args:
@@ -84,7 +86,7 @@ def submit(jobs: Sequence[Job], folder: Path, text: str, at_once: int) -> tuple[
       at_once: tasks at once; 0: as many as SLURM likes.
 
     Returns:
-      The names of what was submitted, and how many jobs were in the queue or trained already.
+      The names of what was submitted, and of what was in the queue or trained already.
     """
     import submitit
 
@@ -113,13 +115,13 @@ def submit(jobs: Sequence[Job], folder: Path, text: str, at_once: int) -> tuple[
             raise UserError(f"submitit: {one_line(error)}") from error
         ids = {job.name: one.job_id for job, one in zip(todo, submitted, strict=True)}
         write_json(file, known | ids)
-    return [job.name for job in todo], len(open_ones) - len(todo)
+    return [job.name for job in todo], [job.name for job in open_ones if job not in todo]
 
 
 def _is_queued(place: Path, cluster: Any, job_id: str | None) -> bool:
-    """Tells whether SLURM has the job, waiting or running; the lock tells of processes here."""
+    """Tells whether SLURM has the job, waiting or running; here its id is that of a process."""
     if job_id is None or cluster == "local":
-        return False
+        return job_id is not None and Path("/proc", job_id).exists()
     from submitit import SlurmJob
 
     return not SlurmJob(place, job_id).done(force_check=True)

@@ -1,7 +1,7 @@
 """What came of a sweep: a row for each point, best first, as text and as CSV."""
 
 import numbers
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,8 +27,13 @@ class Row(NamedTuple):
     summary: dict[str, Any]  # of `seed_statistics.summarize`
 
 
-def make_rows(base: Base, points: Sequence[Point], metric: str) -> list[Row]:
-    """Returns a row for each point, best first; numbers stand in the order of numbers."""
+def make_rows(
+    base: Base, points: Sequence[Point], metric: str, queued: Container[str] = ()
+) -> list[Row]:
+    """Returns a row for each point, best first; numbers stand in the order of numbers.
+
+    Those of the names `queued` wait to be trained, or begin: what was stopped goes on by itself.
+    """
     rows = []
     for point, typed in zip(points, typed_values(base, points), strict=True):
         one = job(base, point)
@@ -36,7 +41,7 @@ def make_rows(base: Base, points: Sequence[Point], metric: str) -> list[Row]:
         status = found.status
         if status != "done" and is_locked(one):
             status = "training"
-        elif status == "stopped" and not one.log.exists():
+        elif status == "stopped" and (one.name in queued or not one.log.exists()):
             status = "waiting"
         summary = summarize(group_of(base, point), metric)
         rows.append(Row(point, typed, status, found.said, summary))

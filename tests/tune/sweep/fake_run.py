@@ -18,7 +18,7 @@ parser.add_argument("experiment")
 parser.add_argument("--runs", type=Path)
 parser.add_argument("--name")
 parser.add_argument("--num-seeds", type=int, default=1)
-parser.add_argument("--resume", action="store_true")
+parser.add_argument("--resume", choices=["auto"])
 parser.add_argument("--allow-changes", action="store_true")
 parser.add_argument("--ppo.learning-rate", type=float, default=3e-4)
 parser.add_argument("--ppo.gamma", type=float, default=0.9)
@@ -50,6 +50,8 @@ def write(seed: int, update: int) -> None:
 
 signal.signal(signal.SIGTERM, stop)
 signal.signal(signal.SIGINT, stop)
+folders = words["runs"].glob("toy_experiment/*/config.json")
+words["resume"] = any(folder.parent.name.startswith(words["name"]) for folder in folders)
 print("resumed" if words["resume"] else "begun", os.environ.get("CUDA_VISIBLE_DEVICES"))
 print("alone" if os.getpgrp() == os.getpid() else "in the group of its scheduler", flush=True)
 if Path("FAIL").exists():

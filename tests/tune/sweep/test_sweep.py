@@ -296,6 +296,30 @@ def test_submitit_carries_points_out(tmp_path, monkeypatch):
     assert "There is no SLURM on this machine" in line
 
 
+@has("submitit")
+def test_the_table_tells_what_slurm_has_and_the_exit_code_what_failed(place, monkeypatch):
+    """Of three points, all in the queue: one has failed, one has begun and holds no lock yet."""
+    words = ["--grid", "ppo.gamma=0.5,0.7,0.9", "--seeds", "1", "--slurm", "timeout_min=1"]
+    monkeypatch.setattr(slurm, "check", lambda text: None)
+    monkeypatch.setattr(slurm, "submit", lambda *of: (["p0000"], ["p0001", "p0002"]))
+    assert start(*words) == SUCCESS
+    assert {row["status"] for row in rows()} == {"waiting"}
+    logs = Path("sweeps/toy_experiment/logs")
+    logs.mkdir()
+    (logs / "p0000.log").write_text("$ python\npurerl: gamma is 0.5.\n[exit code 2]\n")
+    (logs / "p0001.log").write_text("$ python\n")
+    assert start(*words) == FAILURE
+    found = {row["point"]: row["status"] for row in rows()}
+    assert found == {"p0000": "failed", "p0001": "waiting", "p0002": "waiting"}
+
+
+def test_here_a_task_is_in_the_queue_as_long_as_its_process_lives(tmp_path):
+    ended = subprocess.Popen("true")
+    ended.wait()
+    assert slurm._is_queued(tmp_path, "local", str(os.getpid()))
+    assert not slurm._is_queued(tmp_path, "local", str(ended.pid))
+
+
 @pytest.mark.slow
 @has("submitit")
 def test_a_task_whose_time_is_over_saves_and_goes_on(place):
@@ -338,7 +362,7 @@ def test_a_sweep_that_was_killed_ends_as_one_left_in_peace(tmp_path, monkeypatch
     os.kill(int((first / ".lock").read_text()), signal.SIGKILL)
     assert len((first / "metrics.jsonl").read_text().splitlines()) < 150
     assert sweep.main([*words, "--name", "killed", "--jobs", "2"]) == SUCCESS
-    assert "--resume" in Path("sweeps/killed/logs/p0000.log").read_text()
+    assert "Resuming after update" in Path("sweeps/killed/logs/p0000.log").read_text()
     for point in ("p0000", "p0001"):
         lines = [read_lines(Path("sweeps") / name, point) for name in ("peace", "killed")]
         assert lines[0] == lines[1] and list(map(len, lines[0])) == [150, 150]
