@@ -5,28 +5,27 @@ sweep.png. The same command goes on with a sweep that was stopped.
 """
 
 import contextlib
-import sys
 from collections.abc import Sequence
 
-from purerl.core.errors import SUCCESS, USAGE, RunError, UserError
 from purerl.experiment import command_line
-from purerl.machine.command_errors import leave, tell
+from purerl.machine.command_errors import leave
 from purerl.tune.sweep.options import PROG, SweepOptions
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
-    if not arguments or {"-h", "--help"} & set(arguments):
-        with contextlib.suppress(SystemExit):
-            command_line.parse(SweepOptions, ["--help"], PROG)
-        return SUCCESS if arguments else USAGE
-    try:
-        from purerl.tune.sweep.session import execute
+def show_help(words: Sequence[str]) -> None:
+    """Prints the help page."""
+    with contextlib.suppress(SystemExit):
+        command_line.parse(SweepOptions, ["--help"], PROG)
 
-        return execute(arguments)
-    except (UserError, RunError) as error:
-        return tell(error)
+
+def command(words: Sequence[str]) -> int:
+    """Carries the sweep out; returns the exit code."""
+    from purerl.tune.sweep.session import execute
+
+    return execute(words)
+
+
+main = command_line.main_of_words(command, show_help)
 
 
 if __name__ == "__main__":
