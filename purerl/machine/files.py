@@ -191,14 +191,8 @@ def sync(path: Path) -> None:
 
 def sync_tree(folder: Path) -> None:
     """Waits until the disk has all that is in a folder, folders in it too; not its own name."""
-    for place, _, files in os.walk(folder, topdown=False, onerror=_raise):
-        for name in files:
-            sync(Path(place, name))
-        sync(Path(place))
-
-
-def _raise(error: OSError) -> None:
-    raise error
+    for path in (*sorted(folder.rglob("*"), reverse=True), folder):  # what is in it first
+        sync(path)
 
 
 def hash_files(folder: Path) -> dict[str, str]:
