@@ -108,12 +108,7 @@ def evaluate_in_run(
 
 
 def compile_update(
-    config: Config,
-    env: Env,
-    network: Network,
-    abstract: TrainState,
-    vmapped: bool,
-    in_halves: bool,
+    config: Config, env: Env, network: Network, abstract: TrainState, vmapped: bool, in_halves: bool
 ) -> compilation.Compiling:
     """Compiles an update on one device, as one program or `in_halves`: acting, then learning.
 
