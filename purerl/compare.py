@@ -13,7 +13,7 @@ from typing import Annotated
 
 import tyro
 
-from purerl.core.errors import FAILURE, SUCCESS, UserError
+from purerl.core.errors import FAILURE, SUCCESS
 from purerl.experiment.command_line import main_of
 from purerl.machine.command_errors import leave
 from purerl.machine.output import show
@@ -42,8 +42,6 @@ def command(options: CompareOptions) -> int:
     """Compares, prints and writes what was asked for; returns the exit code."""
     from purerl.report import comparison
 
-    if not options.runs:
-        raise UserError("Give the runs to compare: python -m purerl.compare RUN RUN ...")
     result, curves = comparison.compare(options.runs, options.metric, options.group_by)
     show(*comparison.describe(result))
     if options.out is not None:

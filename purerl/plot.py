@@ -35,11 +35,9 @@ def command(options: PlotOptions) -> None:
     from purerl.report.seed_statistics import every_curve, make_groups
     from purerl.report.terminal_plot import check_plotted, draw
 
-    if not options.runs:
-        raise UserError("Give the runs to plot: python -m purerl.plot RUN RUN ...")
     if options.out is not None and options.out.suffix not in (".png", ".pdf", ".svg"):
         raise UserError(f"out is {options.out}; it must end in .png, .pdf or .svg.")
-    runs = read_runs(options.runs)
+    runs = read_runs(options.runs, "plot")
     groups = make_groups(runs, ())
     check_plotted(runs, options.metric)
     curves = [every_curve(group, options.metric) for group in groups]

@@ -34,7 +34,16 @@ MAY_IMPORT = {
         "experiment",
         "runs",
     },
-    "report": {"core", "ppo", "physics", "machine", "experiment", "runs", "training"},
+    "report": {
+        "core",
+        "exact",
+        "ppo",
+        "physics",
+        "machine",
+        "experiment",
+        "runs",
+        "training",
+    },
     "adapters": {"core", "ppo", "physics"},
     "tune": {
         "core",

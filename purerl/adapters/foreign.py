@@ -11,7 +11,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 
 from purerl.core.env import State
 from purerl.core.records import Array, PyTree, is_key
@@ -121,7 +120,7 @@ def unpack(packed: list[Array], template: PyTree) -> Any:
         if is_key(like):
             impl = str(jax.random.key_impl(jnp.empty((0,), like.dtype)))
             return jax.random.wrap_key_data(x, impl=impl)
-        if like.dtype == np.float32:
+        if like.dtype == jnp.float32:
             return jax.lax.bitcast_convert_type(x, jnp.float32)
         return x
 

@@ -29,6 +29,7 @@ from purerl.physics.interface import PhysicsState
 
 _DRAWN = ("qpos", "qvel", "act", "qacc_warmstart", "mocap_pos", "mocap_quat")
 _FEW = 5  # of Gymnasium's names, told to who misspells one
+_INEXACT = "the environment keeps state of its own: a resumed run begins its episodes anew, as lost"
 _STANDS = 0.05  # simulated seconds of a step, where an environment does not say [s]
 
 
@@ -103,9 +104,7 @@ class HostEnv:
     physics: Drawn | None
     action_size: int
     control_timestep: float  # [s]
-    inexact: str = (
-        "the environment keeps state of its own: a resumed run begins its episodes anew, as lost"
-    )
+    inexact: str = _INEXACT
 
     def reset(self, key: Array) -> State:
         """Starts an episode."""
@@ -127,10 +126,9 @@ class HostEnv:
         for name, shape in self.pool.drawn.items():
             size = int(np.prod(shape))
             parts[name], at = row[at : at + size].reshape(shape), at + size
+        time = float32(task[1]) * self.control_timestep
         return State(
-            physics=PhysicsState(time=float32(task[1]) * self.control_timestep, **parts)
-            if parts
-            else (),
+            physics=PhysicsState(time=time, **parts) if parts else (),
             observation=row[3:end],
             reward=reward,
             terminated=terminated,
@@ -195,13 +193,8 @@ class _Pool:
         shape, actions = np.shape(steps), np.asarray(actions, np.float32)
         with self.lock:
             self.sizes.add(max(1, int(np.prod(shape))))
-            lanes = zip(
-                np.reshape(seeds, (-1, 2)),
-                np.reshape(steps, -1),
-                actions.reshape(-1, actions.shape[-1]),
-                strict=True,
-            )
-            rows = [self._step(*lane) for lane in lanes]
+            flat = actions.reshape(-1, actions.shape[-1])
+            rows = list(map(self._step, np.reshape(seeds, (-1, 2)), np.ravel(steps), flat))
             # Episodes that the trainer has left: those of each program may rest for a while.
             while len(self.episodes) > 2 * sum(self.sizes):
                 self.episodes.popitem(last=False)[1].env.close()
@@ -210,9 +203,8 @@ class _Pool:
     def _step(self, seed: np.ndarray, step: int, action: np.ndarray) -> np.ndarray:
         name = tuple(map(int, seed))
         episode = self.episodes.get(name)
-        if step == 1 and (
-            episode is None or episode.action != action.tobytes() or episode.steps > 1
-        ):
+        begun = episode and episode.action == action.tobytes() and episode.steps <= 1
+        if step == 1 and not begun:
             episode = self.episodes[name] = _Episode(episode.env if episode else self.make())
             self._begin(episode.env, seed)
         if episode is None:  # of another process
@@ -223,12 +215,10 @@ class _Pool:
         if episode.steps != step - 1:  # of the past
             return np.full(self.width, np.nan, np.float32)
         scaled = self.low + (np.clip(action, -1, 1) + 1) / 2 * (self.high - self.low)
-        observation, reward, terminated, truncated, _ = episode.env.step(
-            scaled.astype(self.example.action_space.dtype)
-        )
-        episode.row = self._row(episode.env, observation, reward, terminated, truncated)
+        *found, _ = episode.env.step(scaled.astype(self.example.action_space.dtype))
+        episode.row = self._row(episode.env, *found)
         episode.steps, episode.action = int(step), action.tobytes()
-        episode.over = bool(terminated or truncated)
+        episode.over = bool(found[2] or found[3])
         return episode.row
 
     def _begin(self, env: gymnasium.Env, seed: np.ndarray) -> np.ndarray:
@@ -237,12 +227,10 @@ class _Pool:
         observation, _ = env.reset(seed=int(number))
         return self._row(env, observation, 0.0, False, False)
 
-    def _row(
-        self, env: gymnasium.Env, observation: Any, reward: Any, terminated: bool, truncated: bool
-    ) -> np.ndarray:
+    def _row(self, env: gymnasium.Env, observation: Any, *said: Any) -> np.ndarray:
+        """Returns reward, whether it terminated and was truncated, `said`, and what is seen."""
         data = getattr(env.unwrapped, "data", None)
         parts = [np.ravel(getattr(data, name)) for name in self.drawn]
-        said = np.array([reward, terminated, truncated], np.float32)
         return np.concatenate([said, self._flat(observation), *parts], dtype=np.float32)
 
     def _flat(self, observation: Any) -> np.ndarray:

@@ -73,10 +73,6 @@ class Drawer:
         self.renderer = mujoco.Renderer(self.stage.model, height, width)
         self._take = jax.jit(functools.partial(drawing.take_picture, env))
 
-    def begin_episode(self) -> None:
-        """Lets the camera take its height and distance anew."""
-        self.stage.begin_episode()
-
     def draw(self, state: State) -> np.ndarray:
         """Returns the picture of a state, uint8 [height, width, 3]."""
         picture = jax.device_get(self._take(state))
@@ -84,7 +80,3 @@ class Drawer:
         self.renderer.update_scene(self.stage.data, self.stage.camera)
         drawing.add_scenery(self.renderer.scene, picture.scenery)
         return self.renderer.render()
-
-    def close(self) -> None:
-        """Frees what OpenGL holds."""
-        self.renderer.close()

@@ -13,6 +13,8 @@ from purerl.core.env import Env, State
 from purerl.core.records import Array
 from purerl.ppo.episodes import select
 
+Begun = tuple[Any, dict[str, Any]]  # what was observed, and the information beside it
+
 
 def spaces(env: Env) -> tuple[gymnasium.Space, gymnasium.Space]:
     """Returns the spaces of one observation (a Box, or a Dict of them) and one action."""
@@ -56,14 +58,12 @@ class GymnasiumEnv(gymnasium.Env):
         self.drawer = Drawer(env) if render_mode else None
         self._reset, self._step = jax.jit(env.reset), jax.jit(sound_step(env))
 
-    def reset(
-        self, *, seed: int | None = None, options: dict | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> Begun:
         """Starts an episode; the same seed starts the same."""
         super().reset(seed=seed)
         self.state, self.steps = self._reset(new_key(self.np_random)), 0
         if self.drawer:
-            self.drawer.begin_episode()
+            self.drawer.stage.begin_episode()
         return to_numpy(self.state.observation), _info(self.state)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -83,7 +83,7 @@ class GymnasiumEnv(gymnasium.Env):
     def close(self) -> None:
         """Frees what OpenGL holds."""
         if self.drawer:
-            self.drawer.close()
+            self.drawer.renderer.close()
 
 
 def _info(state: State) -> dict[str, Any]:
@@ -114,9 +114,7 @@ class GymnasiumVectorEnv(VectorEnv):
         self._step = jax.jit(jax.vmap(sound_step(env)))
         self._choose = jax.jit(select)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> Begun:
         """Starts all episodes."""
         super().reset(seed=seed)
         self.state = self._start(new_key(self.np_random))

@@ -180,11 +180,7 @@ def update(
 
 
 def compile_update(
-    shards: Shards,
-    config: Config,
-    env: Env,
-    network: Network,
-    abstract: TrainState,
+    shards: Shards, config: Config, env: Env, network: Network, abstract: TrainState
 ) -> Compiling:
     """Compiles an update of several shards, from the `abstract` shapes of the whole state."""
     begin, layout = time.perf_counter(), make_layout(shards, config.num_envs)

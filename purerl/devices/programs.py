@@ -116,12 +116,7 @@ def policy_of(network: Network, state: TrainState) -> Normal:
 
 
 def compile_update(
-    config: Config,
-    env: Env,
-    network: Network,
-    abstract: TrainState,
-    vmapped: bool,
-    in_halves: bool,
+    config: Config, env: Env, network: Network, abstract: TrainState, vmapped: bool, in_halves: bool
 ) -> compilation.Compiling:
     """Compiles an update on one device, as one program or `in_halves`: acting, then learning.
 

@@ -72,7 +72,8 @@ def _broadcast(p: dict, x: np.ndarray) -> np.ndarray:
     return np.broadcast_to(np.expand_dims(x, new), p["shape"])
 
 
-def _slice(p: dict, x: np.ndarray) -> np.ndarray:
+def sliced(p: dict, x: np.ndarray) -> np.ndarray:
+    """Returns what the primitive `slice` takes of an array."""
     strides = p["strides"] or (1,) * x.ndim
     return x[tuple(map(slice, p["start_indices"], p["limit_indices"], strides))]
 
@@ -107,7 +108,7 @@ _RULES: dict[str, Callable[..., np.ndarray]] = {
     "rem": _remainder,
     "reshape": lambda p, x: x.reshape(p["new_sizes"]),
     "select_n": lambda p, which, *cases: np.choose(which.astype(np.int32), cases),
-    "slice": _slice,
+    "slice": sliced,
     "squeeze": lambda p, x: np.squeeze(x, p["dimensions"]),
     "transpose": lambda p, x: np.transpose(x, p["permutation"]),
 }

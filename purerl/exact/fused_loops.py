@@ -22,6 +22,7 @@ from jax import Array, lax
 from jax.extend import core
 
 from purerl.exact import pallas_calls
+from purerl.exact.constants import sliced
 from purerl.exact.traces import CALLS, equations, evaluate, sub_jaxprs
 
 SHORT = 4  # entries of any other axis, at most
@@ -53,17 +54,13 @@ def _long_size(body: core.ClosedJaxpr) -> int | None:
     inner = [sub for eqn in traced for sub in sub_jaxprs(eqn)]
     consts = [np.shape(const) for closed in (body, *inner) for const in closed.consts]
     atoms = [*body.jaxpr.invars, *(v for eqn in traced for v in (*eqn.invars, *eqn.outvars))]
-    shapes = {_shape(v) for v in atoms}
+    shapes = {v.aval.shape for v in atoms}
     if not all(map(_has_rule, traced)) or any(map(_is_long, consts)) or any(0 in s for s in shapes):
         return None
     match list({tuple(n for n in shape if n > SHORT) for shape in shapes} - {()}):
         case [(n,)] if n <= LONGEST:
             return n
     return None
-
-
-def _shape(atom: Any) -> tuple[int, ...]:
-    return atom.aval.shape
 
 
 def _is_long(shape: Sequence[int]) -> bool:
@@ -205,7 +202,7 @@ def _sum(long: Long, eqn: core.JaxprEqn, value: Value) -> list[Value]:
     def along(x: Array) -> Array:
         return jnp.sum(jnp.where(long.inside, x, 0)) if x.ndim else x * long.size
 
-    if any(_shape(eqn.invars[0])[axis] > SHORT for axis in eqn.params["axes"]):
+    if any(eqn.invars[0].aval.shape[axis] > SHORT for axis in eqn.params["axes"]):
         value = _map(along, value)
     return _fold(operator.add, long, eqn, value)
 
@@ -232,12 +229,6 @@ def _broadcast(long: Long, eqn: core.JaxprEqn, value: Value) -> list[Value]:
     spread = np.ones(len(eqn.params["shape"]), int)
     spread[list(eqn.params["broadcast_dimensions"])] = value.shape
     return [np.broadcast_to(value.reshape(tuple(spread)), _short(eqn.params["shape"]))]
-
-
-def _slice(long: Long, eqn: core.JaxprEqn, value: Value) -> list[Value]:
-    starts, limits = eqn.params["start_indices"], eqn.params["limit_indices"]
-    strides = eqn.params["strides"] or (1,) * value.ndim
-    return [value[tuple(map(slice, starts, limits, strides))]]
 
 
 def _dynamic_slice(long: Long, eqn: core.JaxprEqn, value: Value, start: Value) -> list[Value]:
@@ -269,8 +260,8 @@ _RULES: dict[str, Callable[..., list[Value]]] = {
     "dynamic_slice": _dynamic_slice,
     "reduce_or": functools.partial(_fold, operator.or_),
     "reduce_sum": _sum,
-    "slice": _slice,
-    "squeeze": lambda long, eqn, value: [value.reshape(_shape(eqn.outvars[0]))],
+    "slice": lambda long, eqn, value: [sliced(eqn.params, value)],
+    "squeeze": lambda long, eqn, value: [value.reshape(eqn.outvars[0].aval.shape)],
     "stack": lambda long, eqn, *values: [np.stack(values, eqn.params["axis"])],
     **dict.fromkeys(CALLS, lambda long, eqn, *args: _evaluate(long, sub_jaxprs(eqn)[0], *args)),
 }

@@ -42,11 +42,8 @@ def unordered_sums(f: Callable, *example: Any) -> list[ScatterSum]:
 
 def unordered_in(closed: core.ClosedJaxpr) -> list[ScatterSum]:
     """Lists the sums of a trace whose order nothing fixes on a GPU, at any depth."""
-    return [
-        ScatterSum(eqn.primitive.name, eqn.invars[0].aval.shape, source(eqn))
-        for eqn in equations(closed)
-        if _is_unordered(eqn)
-    ]
+    found = filter(_is_unordered, equations(closed))
+    return [ScatterSum(e.primitive.name, e.invars[0].aval.shape, source(e)) for e in found]
 
 
 def _is_unordered(eqn: core.JaxprEqn) -> bool:

@@ -48,13 +48,10 @@ def call(
     from jax.experimental import pallas
     from jax.experimental.pallas import triton
 
-    return pallas.pallas_call(
-        kernel,
-        results,
-        grid=grid,
-        compiler_params=triton.CompilerParams(num_warps=1),
-        interpret=(platform or jax.default_backend()) != "gpu",
-    )(*inputs)
+    warp = triton.CompilerParams(num_warps=1)
+    interpret = (platform or jax.default_backend()) != "gpu"
+    run = pallas.pallas_call(kernel, results, grid=grid, compiler_params=warp, interpret=interpret)
+    return run(*inputs)
 
 
 def copy(rows: list[Array]) -> list[Array]:

@@ -70,9 +70,8 @@ def product(params: dict, left: Array, right: Array) -> Array:
     right = lax.reshape(right, (*batch, k, math.prod(n)))
     b = len(batch)
     axes = ((b + 1,), (b,)), (tuple(range(b)),) * 2
-    plain: Any = lax.dot_general_p.bind(
-        *lax.optimization_barrier((left, right)), **params | {"dimension_numbers": axes}
-    )
+    left, right = lax.optimization_barrier((left, right))
+    plain: Any = lax.dot_general_p.bind(left, right, **params | {"dimension_numbers": axes})
     return lax.reshape(lax.optimization_barrier(plain), (*batch, *m, *n))
 
 
@@ -140,12 +139,8 @@ def reflections(params: dict, matrix: Array) -> tuple[Array, Array]:
     return q[..., :kept], jnp.triu(r[..., :kept, :])
 
 
-REPLACED: dict[str, Callable] = {
-    "dot_general": product,
-    "cholesky": factor,
-    "triangular_solve": solution,
-    "qr": reflections,
-}
+REPLACED: dict[str, Callable] = {"dot_general": product, "cholesky": factor}
+REPLACED |= {"triangular_solve": solution, "qr": reflections}
 
 
 def _wants(eqn: core.JaxprEqn) -> bool:

@@ -17,12 +17,9 @@ CALLS = ("jit", "closed_call", "core_call", "checkpoint", "remat", "remat2", *CU
 def sub_jaxprs(eqn: core.JaxprEqn) -> list[core.ClosedJaxpr]:
     """Returns the traces inside one equation (loop bodies, branches, a called function)."""
     params = (x if isinstance(x, tuple | list) else (x,) for x in eqn.params.values())
-    traces = (item for items in params for item in items)
-    return [
-        x if isinstance(x, core.ClosedJaxpr) else core.ClosedJaxpr(x, ())  # one class since 0.11
-        for x in traces
-        if isinstance(x, core.Jaxpr | core.ClosedJaxpr)
-    ]
+    found = [x for some in params for x in some if isinstance(x, core.Jaxpr | core.ClosedJaxpr)]
+    # They are one class since 0.11.
+    return [x if isinstance(x, core.ClosedJaxpr) else core.ClosedJaxpr(x, ()) for x in found]
 
 
 def equations(closed: core.ClosedJaxpr) -> Iterator[core.JaxprEqn]:

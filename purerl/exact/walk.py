@@ -15,15 +15,8 @@ import numpy as np
 from jax import Array, lax
 from jax.extend import core
 
+from purerl.exact import traces
 from purerl.exact.constants import as_value, fold, is_known
-from purerl.exact.traces import (
-    CALLS,
-    CUSTOM_DERIVATIVES,
-    bind_equation,
-    evaluate,
-    sub_jaxprs,
-    with_own_derivative,
-)
 
 Inside = Callable[..., list]  # (trace, *args) -> results: the same walk, further in
 
@@ -68,13 +61,13 @@ def _run(rules: tuple[Rule, ...], shared: dict, closed: core.ClosedJaxpr, *args:
         found = _apply(rules, eqn, inputs, inside)
         return [y if x is None else x for x, y in zip(known, found, strict=True)]
 
-    return evaluate(_prune(closed), apply, as_value, *args)
+    return traces.evaluate(_prune(closed), apply, as_value, *args)
 
 
 def _is_wanted(rules: tuple[Rule, ...], eqn: core.JaxprEqn) -> bool:
     """Tells whether a rule wants an equation or one inside of it."""
     return any(rule.wants(eqn) for rule in rules) or any(
-        _is_wanted(rules, inner) for sub in sub_jaxprs(eqn) for inner in sub.jaxpr.eqns
+        _is_wanted(rules, inner) for sub in traces.sub_jaxprs(eqn) for inner in sub.jaxpr.eqns
     )
 
 
@@ -84,24 +77,25 @@ def _apply(
     """Runs one equation by the first rule that applies, or as it is with its inside rewritten."""
     name = eqn.primitive.name
     if not _is_wanted(rules, eqn):
-        return bind_equation(eqn, *inputs)
+        return traces.bind_equation(eqn, *inputs)
     for rule in rules:
         outputs = rule.replace(eqn, inputs, inside) if rule.wants(eqn) else None
         if outputs is not None:
             return outputs
-    if name in CUSTOM_DERIVATIVES:
-        return with_own_derivative(eqn, functools.partial(_call, eqn, inputs, inside), inputs)
-    if name in CALLS:
-        return inside(sub_jaxprs(eqn)[0], *inputs)
+    if name in traces.CUSTOM_DERIVATIVES:
+        call = functools.partial(_call, eqn, inputs, inside)
+        return traces.with_own_derivative(eqn, call, inputs)
+    if name in traces.CALLS:
+        return inside(traces.sub_jaxprs(eqn)[0], *inputs)
     if name in LOOPS:
         return LOOPS[name](eqn.params, inputs, inside)
-    return bind_equation(eqn, *inputs)
+    return traces.bind_equation(eqn, *inputs)
 
 
 def _call(eqn: core.JaxprEqn, inputs: Sequence, inside: Inside, *traced: Array) -> list:
     """Calls a function on its inputs as they are traced now, but for those that are known."""
     args = [x if is_known(x) else y for x, y in zip(inputs, traced, strict=True)]
-    return inside(sub_jaxprs(eqn)[0], *args)
+    return inside(traces.sub_jaxprs(eqn)[0], *args)
 
 
 def scan(params: dict, inputs: Sequence, inside: Inside) -> list:
@@ -112,10 +106,8 @@ def scan(params: dict, inputs: Sequence, inside: Inside) -> list:
         out = inside(params["jaxpr"], *inputs[:n], *carry, *x)
         return out[:m], out[m:]
 
-    carry, xs = list(inputs[n : n + m]), list(inputs[n + m :])
-    carry, ys = lax.scan(
-        step, carry, xs, params["length"], reverse=params["reverse"], unroll=params["unroll"]
-    )
+    how = {name: params[name] for name in ("length", "reverse", "unroll")}
+    carry, ys = lax.scan(step, list(inputs[n : n + m]), list(inputs[n + m :]), **how)
     return [*carry, *ys]
 
 

@@ -227,10 +227,7 @@ def _wrong_choice(found: re.Match[str]) -> str:
 
 # Python's words and tyro's, and ours.
 _IN_WORDS: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
-    (
-        r"^Error parsing (\S+): invalid literal .*?: (.*)",
-        r"\1 is \2; it must be a whole number",
-    ),
+    (r"^Error parsing (\S+): invalid literal .*?: (.*)", r"\1 is \2; it must be a whole number"),
     (r"^Error parsing (\S+): could not convert .*?: (.*)", r"\1 is \2; it must be a number"),
     (
         r"^Error parsing (\S+): Could not find valid parse for arguments: \[(.*)\]",

@@ -1,5 +1,6 @@
 """How a command ends: its exit code, and its error as one line."""
 
+import importlib.util
 import os
 import signal
 import sys
@@ -8,6 +9,7 @@ import time
 from collections.abc import Callable
 from typing import NoReturn
 
+import purerl
 from purerl.core.errors import RunError, StoppedError, UserError, one_line
 from purerl.machine import output
 
@@ -18,6 +20,13 @@ def tell(error: UserError | RunError | StoppedError) -> int:
     """Prints an error as one line and returns its exit code."""
     output.warn(f"purerl: {error}")
     return error.exit_code
+
+
+def check_installed(package: str, extra: str) -> None:
+    """Raises UserError, with the line to paste, unless a package of an extra is there."""
+    if importlib.util.find_spec(package) is None:
+        line = purerl.how_to_install(extra)
+        raise UserError(f"The package {package} is not installed; run: {line}")
 
 
 def leave(command: Callable[[], int]) -> NoReturn:

@@ -35,10 +35,13 @@ class FolderLock:
     system locks no folder, the file `.lock` in it is. That file says who writes.
     """
 
-    def __init__(self, folder: Path, patience: float = PATIENCE) -> None:
-        """Makes the folder and locks it; UserError if another process writes it, for so many s."""
+    def __init__(self, folder: Path, patience: float = PATIENCE, held: str = "") -> None:
+        """Makes the folder and locks it; UserError if another process writes it, for so many s.
+
+        `held` is how the error begins, where the folder is not a run's.
+        """
         make_folder(folder)
-        self.folder = folder
+        self.folder, self.held = folder, held
         self.handles = [os.open(folder, os.O_RDONLY | os.O_DIRECTORY)]
         try:
             self.handles.append(os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o644))
@@ -55,10 +58,8 @@ class FolderLock:
             _lock(handle, patience)
         except BlockingIOError as error:
             owner = os.pread(self.handles[1], 20, 0).decode(errors="replace").strip() or "unknown"
-            raise UserError(
-                f"The run {self.folder} is being written by process {owner}; stop that one first, "
-                "or use another --name."
-            ) from error
+            held = self.held or f"The run {self.folder} is being written by process {owner}"
+            raise UserError(f"{held}; stop that one first, or use another --name.") from error
         except OSError as error:
             if error.errno in NO_LOCKS:
                 return False

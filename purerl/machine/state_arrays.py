@@ -18,10 +18,8 @@ Leaves = dict[str, np.ndarray]
 
 def leaf_paths(state: PyTree) -> list[str]:
     """Returns the path of every leaf, in the order of `jax.tree.leaves`; abstract states too."""
-    return [
-        "/".join(map(_name, path)) + (f"|{_impl(leaf)}" if is_key(leaf) else "")
-        for path, leaf in jax.tree_util.tree_leaves_with_path(state)
-    ]
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    return ["/".join(map(_name, at)) + (f"|{_impl(x)}" if is_key(x) else "") for at, x in leaves]
 
 
 def _name(entry: Any) -> str:
@@ -52,9 +50,8 @@ def unflatten(leaves: Leaves, abstract: PyTree) -> PyTree:
         if is_key(like) and not like.size:
             raise ValueError(f"A zero-size array of keys (shape {like.shape}) cannot be rebuilt.")
         # A real copy again: a buffer shared with numpy must not be donated.
-        array = jnp.array(
-            leaves[path] if like.size else np.zeros(like.shape, like.dtype), copy=True
-        )
+        stored = leaves[path] if like.size else np.zeros(like.shape, like.dtype)
+        array = jnp.array(stored, copy=True)
         out.append(jax.random.wrap_key_data(array, impl=_impl(like)) if is_key(like) else array)
     return jax.tree.unflatten(jax.tree.structure(abstract), out)
 

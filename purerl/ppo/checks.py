@@ -21,10 +21,7 @@ TRAINING = (
     ("in [0, 2]", lambda x: 0.0 <= x <= 2.0, "noise_color"),
     ("finite", math.isfinite, "entropy_target"),
 )
-EVALUATION = (
-    (*SIZE, "num_episodes"),
-    ("at least 0", lambda x: x >= 0, "number"),
-)
+EVALUATION = ((*SIZE, "num_episodes"), ("at least 0", lambda x: x >= 0, "number"))
 
 
 def check_rules(settings: Any, rules: tuple) -> None:

@@ -35,11 +35,9 @@ def command(options: ReportOptions) -> None:
     from purerl.report.page import make_page
     from purerl.report.run_reader import read_runs
 
-    if not options.runs:
-        raise UserError("Give the runs to report: python -m purerl.report RUN RUN ...")
     if options.out.is_dir():
         raise UserError(f"{options.out} is a folder: give a file, as --out {options.out}/a.html.")
-    runs = read_runs(options.runs)
+    runs = read_runs(options.runs, "report")
     page = make_page(runs, options.group_by).encode()
     write_answer(options.out, page)
     number = f"{len(runs)} run{'s' * (len(runs) > 1)}"

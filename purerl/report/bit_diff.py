@@ -16,11 +16,9 @@ def compare_bits(a: RunRecord, b: RunRecord) -> dict[str, Any]:
       What was found, as JSON values; "lines" is for a person.
     """
     conditions = manifest.differences(a.manifest, b.manifest)
-    conditions += [
-        f"{run.path} went on after a change (manifest.json, allowed_changes)"
-        for run in (a, b)
-        if run.manifest.get("allowed_changes")
-    ]
+    for run in (a, b):
+        if run.manifest.get("allowed_changes"):
+            conditions.append(f"{run.path} went on after a change (manifest.json, allowed_changes)")
     if a.source != b.source:
         conditions.append("experiment.py: the files differ")
     ours, theirs = (

@@ -136,10 +136,8 @@ def _percentiles(replicates: Values, counts: Values) -> Interval:
     order = np.argsort(replicates)
     ends = np.cumsum(counts[order])
     places = (ends[-1] - 1) * np.array([0.5 - LEVEL / 2, 0.5 + LEVEL / 2])
-    below, above = (
-        replicates[order][np.searchsorted(ends, x, side="right")]
-        for x in (np.floor(places), np.ceil(places))
-    )
+    around = np.searchsorted(ends, [np.floor(places), np.ceil(places)], side="right")
+    below, above = replicates[order][around]
     low, high = below + (above - below) * (places % 1)  # as `np.percentile`
     return Interval(float(low), float(high))
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import io
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ LONGEST_LABEL = 60  # beside the other columns it fits a wide terminal
 
 
 def compare(
-    places: Iterable[Path], metric: str, group_by: Sequence[str]
+    places: Sequence[Path], metric: str, group_by: Sequence[str]
 ) -> tuple[dict[str, Any], list[Curve]]:
     """Compares runs bit by bit where they should be equal, and by statistics over seeds.
 
@@ -48,7 +49,7 @@ def compare(
     Raises:
       UserError: a place means no run, or there is no such metric or setting.
     """
-    runs = run_reader.read_runs(places)
+    runs = run_reader.read_runs(places, "compare")
     result, curves = compare_records(runs, metric, group_by)
     if result["unscored"] and not result["pairs"]:  # else the bits can be compared all the same
         raise UserError(result["unscored"])
@@ -69,9 +70,8 @@ def compare_records(
         seed_statistics.check_scored(runs, groups, metric)
     except UserError as error:
         groups, unscored = [], str(error)
-    conditions = [
-        line for run in runs[1:] for line in manifest.differences(runs[0].manifest, run.manifest)
-    ]
+    first_of_all, *others = [run.manifest for run in runs]
+    conditions = [line for other in others for line in manifest.differences(first_of_all, other)]
     against = [seed_statistics.versus(group, groups[0], metric) for group in groups[1:]]
     curves = [seed_statistics.learning_curve(group, metric) for group in groups]
     result = {
@@ -140,13 +140,12 @@ def notes(summaries: Sequence[dict[str, Any]]) -> list[str]:
     left_out = sum(s["unfinished"] for s in summaries)
     silent = sum(s["done"] + s["failed"] - s["n"] for s in summaries)
     few = any(0 < s["n"] < LEAST_IQM for s in summaries)
+    failed = any(s["failed"] for s in summaries)
     found = {
         f"Below {LEAST_IQM} seeds there is no IQM: what is compared and drawn is the mean.": few,
         f"No interval (-) below {LEAST_RUNS} seeds of a configuration, where it would be too "
         "narrow. Ten seeds are a good number.": any(s["interval"] is None for s in summaries),
-        "Failed runs (non-finite numbers) count with the last value they reached.": any(
-            s["failed"] for s in summaries
-        ),
+        "Failed runs (non-finite numbers) count with the last value they reached.": failed,
         f"{left_out} unfinished runs are left out.": left_out,
         f"{silent} runs have no value of the metric and are left out.": silent,
     }
@@ -203,10 +202,16 @@ def _curve_rows(curves: Iterable[Curve]) -> Iterator[dict[str, Any]]:
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> None:
     """Writes rows; what is None or missing is an empty cell."""
-    with path.open("w", newline="", errors="backslashreplace") as file:
-        writer = csv.DictWriter(file, columns, extrasaction="ignore")
-        writer.writeheader()
-        writer.writerows(rows)
+    path.write_bytes(csv_text(columns, rows).encode(errors="backslashreplace"))
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[dict[str, Any]], end: str = "\r\n") -> str:
+    """Returns rows as CSV, each with the `end` of its line."""
+    written = io.StringIO()
+    writer = csv.DictWriter(written, columns, extrasaction="ignore", lineterminator=end)
+    writer.writeheader()
+    writer.writerows(rows)
+    return written.getvalue()
 
 
 def plotter() -> Any:

@@ -4,22 +4,15 @@ Functions within functions are opened, steps that no output needs are left out. 
 every input is the batch. It is traced with a size that nothing else has, and may have any other.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax.extend.core import Literal
 
 from purerl.core.records import PyTree
-
-# What only calls another function; the parameter that holds it is one of _BODIES.
-_CALLS = {
-    "checkpoint", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call",
-    "custom_vjp_call_jaxpr", "jit", "pjit", "remat", "remat2",
-}  # fmt: skip
-_BODIES = ("jaxpr", "call_jaxpr", "fun_jaxpr")
+from purerl.exact import traces
 
 # A prime: what it divides depends on the batch. No array of that size is made.
 BATCH = 1_000_003
@@ -52,12 +45,25 @@ def flat_program(function: Callable[..., PyTree], *examples: PyTree) -> Program:
     The program is of a batch of them.
     """
     abstract = batched(examples)
+    inputs, steps = range(len(jax.tree.leaves(abstract))), list[Step]()
+    numbers = itertools.count(len(inputs))
+
+    def add(equation: Any, *values: Any) -> list[Any]:
+        """Adds one equation, opens it, or computes it; returns its outputs."""
+        name, params = equation.primitive.name, equation.params
+        if name in traces.CALLS:
+            return traces.evaluate(traces.sub_jaxprs(equation)[0], add, np.asarray, *values)
+        if not any(isinstance(value, int) for value in values):
+            return _compute(equation, values)
+        results = tuple(itertools.islice(numbers, len(equation.outvars)))
+        types = tuple(atom.aval for atom in equation.invars)
+        steps.append(Step(name, params, values, results, types, equation.outvars[0].aval))
+        return list(results)
+
     closed = jax.make_jaxpr(function)(*abstract)
-    inputs = range(len(jax.tree.leaves(abstract)))
-    opened = _Opened(len(inputs))
-    outputs = tuple(opened.open(closed.jaxpr, closed.consts, list(inputs)))
-    steps, needed = _needed(opened.steps, outputs)
-    return Program(steps, outputs, frozenset(needed & set(inputs)))
+    outputs = tuple(traces.evaluate(closed, add, np.asarray, *inputs))
+    kept, needed = _needed(steps, outputs)
+    return Program(kept, outputs, frozenset(needed & set(inputs)))
 
 
 def batched(examples: PyTree, batch: Any = BATCH) -> PyTree:
@@ -81,51 +87,10 @@ def _needed(steps: Sequence[Step], outputs: Sequence[Value]) -> tuple[list[Step]
     return kept[::-1], needed
 
 
-@dataclass
-class _Opened:
-    """Steps, as they are collected."""
-
-    number: int  # of values so far
-    steps: list[Step] = field(default_factory=list)
-
-    def open(self, jaxpr: Any, constants: Sequence[Any], inputs: Sequence[Value]) -> list[Value]:
-        """Adds the steps of a jaxpr called with `inputs`; returns its outputs."""
-        known: dict[Any, Value] = dict(
-            zip(jaxpr.constvars, map(np.asarray, constants), strict=True)
-        )
-        known |= dict(zip(jaxpr.invars, inputs, strict=True))
-
-        def value(atom: Any) -> Value:
-            if isinstance(atom, Literal):
-                return np.asarray(atom.val, jax.typeof(atom.val).dtype)
-            return known[atom]
-
-        for equation in jaxpr.eqns:
-            results = self.equation(equation, [value(atom) for atom in equation.invars])
-            known |= dict(zip(equation.outvars, results, strict=True))
-        return [value(atom) for atom in jaxpr.outvars]
-
-    def equation(self, equation: Any, inputs: list[Value]) -> list[Value]:
-        """Adds one equation, opens it, or computes it; returns its outputs."""
-        name, params = equation.primitive.name, equation.params
-        if name in _CALLS:
-            body = next(params[body] for body in _BODIES if body in params)
-            return self.open(getattr(body, "jaxpr", body), getattr(body, "consts", ()), inputs)
-        if not any(isinstance(value, int) for value in inputs):
-            return _compute(equation, inputs)
-        results = tuple(range(self.number, self.number + len(equation.outvars)))
-        self.number += len(results)
-        types = tuple(atom.aval for atom in equation.invars)
-        result = equation.outvars[0].aval
-        self.steps.append(Step(name, params, tuple(inputs), results, types, result))
-        return list(results)
-
-
-def _compute(equation: Any, inputs: list[Any]) -> list[Value]:
+def _compute(equation: Any, inputs: Sequence[Any]) -> list[np.ndarray]:
     """Computes an equation of constants; an axis of the batch has one row, to be broadcast."""
-    shapes = ("shape", "new_sizes")
-    params = {k: tuple(sizes(v, 1)) if k in shapes else v for k, v in equation.params.items()}
+    shapes, given = ("shape", "new_sizes"), equation.params
+    params = {k: tuple(sizes(v, 1)) if k in shapes else v for k, v in given.items()}
     if params.get("sharding", 0) is not None:
         params.pop("sharding", None)
-    results = equation.primitive.bind(*inputs, **params)
-    return [np.asarray(x) for x in (results if equation.primitive.multiple_results else [results])]
+    return [np.asarray(x) for x in traces.bind_equation(equation.replace(params=params), *inputs)]

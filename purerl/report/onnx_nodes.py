@@ -1,6 +1,6 @@
 """JAX's primitives as nodes of ONNX, operator set 17; one function for each kind."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,12 +27,11 @@ class Nodes:
     def write(self, program: Program, outputs: list[str]) -> None:
         """Adds a program's steps; its outputs get their names."""
         for step in program.steps:
-            made = write_step(self, step, list(step.inputs))
+            made = write_step(self, step, step.inputs)
             many = made if isinstance(made, list) else [made]
             self.names |= dict(zip(step.outputs, many, strict=True))
         for value, name in zip(program.outputs, outputs, strict=True):
-            whole = self.name(value)
-            self.nodes.append(helper.make_node("Identity", [whole], [name]))
+            self.nodes.append(helper.make_node("Identity", [self.name(value)], [name]))
 
     def name(self, value: Value | str) -> str:
         """Returns the name of a value, a constant being added under a new one."""
@@ -58,35 +57,28 @@ class Nodes:
         if key == shape:
             return self.node("Expand", value, np.asarray(shape, np.int64))
         if key not in self.shapes:
-            self.shapes[key] = self._shape(key)
+            zero, one = _integers([0]), _integers([1])
+            size = self.node("Slice", self.node("Shape", self.first), zero, one)
+            parts = (_integers([n]) if n else size for n in key)
+            self.shapes[key] = self.node("Concat", *parts, axis=0)
         return self.node("Expand", value, self.shapes[key])
 
-    def _shape(self, shape: tuple[int, ...]) -> str:
-        """Adds a shape with the batch's size where there is a 0."""
-        size = self.node("Slice", self.node("Shape", self.first), _one(0), _one(1))
-        return self.node("Concat", *(_one(n) if n else size for n in shape), axis=0)
+
+Inputs = Sequence[Any]
+Writer = Callable[[Nodes, Step, Inputs], Any]
+
+# JAX's name -> ONNX's, of the same arguments; most differ by the first letter alone.
+_SAME = {name: name.capitalize() for name in (
+    "abs", "acos", "add", "and", "asin", "atan", "ceil", "cos", "cosh", "div", "erf", "exp",
+    "floor", "log", "max", "min", "mul", "neg", "not", "or", "pow", "sign", "sin", "sinh", "sqrt",
+    "sub", "tan", "tanh",
+)}  # fmt: skip
+_SAME |= dict.fromkeys(("copy", "copy_p", "optimization_barrier", "stop_gradient"), "Identity")
+_SAME |= {"add_any": "Add", "eq": "Equal", "logistic": "Sigmoid"}
+_SAME |= {"ge": "GreaterOrEqual", "gt": "Greater", "le": "LessOrEqual", "lt": "Less"}
 
 
-def _one(number: int) -> np.ndarray:
-    return np.asarray([number], np.int64)
-
-
-Writer = Callable[[Nodes, Step, list[Any]], Any]
-
-# JAX's name -> ONNX's, of the same arguments.
-_SAME = {
-    "abs": "Abs", "acos": "Acos", "add": "Add", "add_any": "Add", "and": "And", "asin": "Asin",
-    "atan": "Atan", "ceil": "Ceil", "copy": "Identity", "copy_p": "Identity", "cos": "Cos",
-    "cosh": "Cosh", "div": "Div", "eq": "Equal", "erf": "Erf", "exp": "Exp", "floor": "Floor",
-    "ge": "GreaterOrEqual", "gt": "Greater", "le": "LessOrEqual", "log": "Log",
-    "logistic": "Sigmoid", "lt": "Less", "max": "Max", "min": "Min", "mul": "Mul", "neg": "Neg",
-    "not": "Not", "optimization_barrier": "Identity", "or": "Or", "pow": "Pow", "sign": "Sign",
-    "sin": "Sin", "sinh": "Sinh", "sqrt": "Sqrt", "stop_gradient": "Identity", "sub": "Sub",
-    "tan": "Tan", "tanh": "Tanh",
-}  # fmt: skip
-
-
-def write_step(graph: Nodes, step: Step, inputs: list[Any]) -> Any:
+def write_step(graph: Nodes, step: Step, inputs: Inputs) -> Any:
     """Adds the nodes of a step; returns the name of its output, or a list of them.
 
     Raises:
@@ -110,26 +102,25 @@ def _integers(values: Any) -> np.ndarray:
     return np.asarray(list(values), np.int64)
 
 
-def _reshape(graph: Nodes, step: Step, inputs: list[Any]) -> Any:
+def _reshape(graph: Nodes, step: Step, inputs: Inputs) -> Any:
     """At most one size depends on the batch: the one that ONNX works out."""
     return graph.node("Reshape", inputs[0], _integers(sizes(step.result.shape, -1)))
 
 
-def _broadcast(graph: Nodes, step: Step, inputs: list[Any]) -> Any:
+def _broadcast(graph: Nodes, step: Step, inputs: Inputs) -> Any:
     shape, axes = step.result.shape, step.params["broadcast_dimensions"]
-    (old,) = (t.shape for t in step.types[:1])
     aligned = [1] * len(shape)
-    for axis, size in zip(axes, sizes(old, -1), strict=True):
+    for axis, size in zip(axes, sizes(step.types[0].shape, -1), strict=True):
         aligned[axis] = size
     return graph.batched(graph.node("Reshape", inputs[0], _integers(aligned)), shape)
 
 
-def _concatenate(graph: Nodes, step: Step, inputs: list[Any]) -> Any:
+def _concatenate(graph: Nodes, step: Step, inputs: Inputs) -> Any:
     whole = [graph.batched(x, t.shape) for x, t in zip(inputs, step.types, strict=True)]
     return graph.node("Concat", *whole, axis=step.params["dimension"])
 
 
-def _slice(graph: Nodes, step: Step, inputs: list[Any]) -> Any:
+def _slice(graph: Nodes, step: Step, inputs: Inputs) -> Any:
     starts, stops = step.params["start_indices"], step.params["limit_indices"]
     axes = [i for i, stop in enumerate(sizes(stops, -1)) if stop >= 0]  # the batch stays whole
     strides = step.params["strides"] or (1,) * len(starts)
@@ -137,12 +128,12 @@ def _slice(graph: Nodes, step: Step, inputs: list[Any]) -> Any:
     return graph.node("Slice", inputs[0], first, last, _integers(axes), by)
 
 
-def _split(graph: Nodes, step: Step, inputs: list[Any]) -> Any:
+def _split(graph: Nodes, step: Step, inputs: Inputs) -> Any:
     parts = _integers(step.params["sizes"])
     return graph.node("Split", inputs[0], parts, outputs=len(parts), axis=step.params["axis"])
 
 
-def _dot(graph: Nodes, step: Step, inputs: list[Any]) -> Any:
+def _dot(graph: Nodes, step: Step, inputs: Inputs) -> Any:
     """x [..., H] @ kernel [H, ...]: layers. Other products stand in no usual network."""
     (left, right), batch = step.params["dimension_numbers"]
     ranks = [len(t.shape) for t in step.types]
@@ -155,13 +146,13 @@ def _dot(graph: Nodes, step: Step, inputs: list[Any]) -> Any:
     return graph.node("MatMul", inputs[0], kernel)
 
 
-def _select(graph: Nodes, step: Step, inputs: list[Any]) -> Any:
+def _select(graph: Nodes, step: Step, inputs: Inputs) -> Any:
     if len(inputs) != 3 or step.types[0].dtype != bool:
         raise UserError("The network selects between more than two cases: use --format jax.")
     return graph.node("Where", inputs[0], inputs[2], inputs[1])
 
 
-def _convert(graph: Nodes, step: Step, inputs: list[Any]) -> Any:
+def _convert(graph: Nodes, step: Step, inputs: Inputs) -> Any:
     kinds = {"float32": 1, "int32": 6, "int64": 7, "bool": 9, "float64": 11}
     name = np.dtype(step.params["new_dtype"]).name
     if name not in kinds:
@@ -169,11 +160,7 @@ def _convert(graph: Nodes, step: Step, inputs: list[Any]) -> Any:
     return graph.node("Cast", inputs[0], to=kinds[name])
 
 
-def _power(graph: Nodes, step: Step, inputs: list[Any]) -> Any:
-    return graph.node("Pow", inputs[0], _number(step, step.params["y"]))
-
-
-def _expm1(graph: Nodes, step: Step, inputs: list[Any]) -> Any:
+def _expm1(graph: Nodes, step: Step, inputs: Inputs) -> Any:
     """Below 1, 2 t / (1 - t) with t = tanh(x/2): there e^x - 1 loses digits."""
     x, one = inputs[0], _number(step, 1)
     half = graph.node("Mul", graph.node("Min", x, one), _number(step, 0.5))
@@ -183,37 +170,27 @@ def _expm1(graph: Nodes, step: Step, inputs: list[Any]) -> Any:
     return graph.node("Where", graph.node("Less", x, one), small, large)
 
 
-def _sum(graph: Nodes, step: Step, inputs: list[Any]) -> Any:
-    return graph.node("ReduceSum", inputs[0], _integers(step.params["axes"]), keepdims=0)
-
-
 def _reduce(kind: str) -> Writer:
-    def write(graph: Nodes, step: Step, inputs: list[Any]) -> Any:
-        return graph.node(kind, inputs[0], axes=list(step.params["axes"]), keepdims=0)
-
-    return write
-
-
-def _clamp(graph: Nodes, step: Step, inputs: list[Any]) -> Any:
-    low, x, high = inputs
-    return graph.node("Min", graph.node("Max", x, low), high)
+    return lambda g, s, x: g.node(kind, x[0], axes=list(s.params["axes"]), keepdims=0)
 
 
 _OTHERS: dict[str, Writer] = {
     "broadcast_in_dim": _broadcast,
-    "clamp": _clamp,
+    "clamp": lambda g, s, x: g.node("Min", g.node("Max", x[1], x[0]), x[2]),
     "concatenate": _concatenate,
     "convert_element_type": _convert,
     "dot_general": _dot,
     "erfc": lambda g, s, x: g.node("Sub", _number(s, 1), g.node("Erf", x[0])),
     "expand_dims": _reshape,
     "expm1": _expm1,
-    "integer_pow": _power,
+    "integer_pow": lambda g, s, x: g.node("Pow", x[0], _number(s, s.params["y"])),
     "log1p": lambda g, s, x: g.node("Log", g.node("Add", x[0], _number(s, 1))),
     "ne": lambda g, s, x: g.node("Not", g.node("Equal", *x)),
     "reduce_max": _reduce("ReduceMax"),
     "reduce_min": _reduce("ReduceMin"),
-    "reduce_sum": _sum,
+    "reduce_sum": lambda g, s, x: g.node(
+        "ReduceSum", x[0], _integers(s.params["axes"]), keepdims=0
+    ),
     "reshape": _reshape,
     "rsqrt": lambda g, s, x: g.node("Reciprocal", g.node("Sqrt", x[0])),
     "select_n": _select,

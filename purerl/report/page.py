@@ -14,7 +14,7 @@ from typing import Any
 from purerl.report import comparison, page_series, page_tables
 from purerl.report.html_elements import Html, element, join
 from purerl.report.page_charts import SMALL, WIDE, chart, look, short
-from purerl.report.page_media import LARGEST_PAGE, Media, media_elements, read_media, size
+from purerl.report.page_media import LARGEST_PAGE, media_elements, read_media
 from purerl.report.run_reader import RunRecord
 from purerl.report.seed_statistics import Group, make_groups
 
@@ -58,14 +58,10 @@ def _section(title: str, *inside: Html) -> list[Html]:
 def _document(title: str, body: Sequence[Html], data: Html) -> str:
     """Returns the page around its body."""
     style, script = (Html((HERE / f"page.{kind}").read_text()) for kind in ("css", "js"))
-    allowed = {
-        "default-src": "'none'",
-        "style-src": _digest(style),
-        "script-src": _digest(script),
-        "img-src": "data:",
-        "media-src": "data:",
-    }
-    policy = "; ".join(f"{kind} {source}" for kind, source in allowed.items())
+    policy = (
+        f"default-src 'none'; style-src {_digest(style)}; script-src {_digest(script)}; "
+        "img-src data:; media-src data:"
+    )
     head = element(
         "head",
         element("meta", charset="utf-8"),
@@ -98,9 +94,8 @@ def _controls(groups: Sequence[Group]) -> Html:
         label = f"{group.label} (n = {len(group.runs)})"
         boxes = [_box(f"g{g}", label, look(g, None, several), key=f"{g}/mean")]
         for r, run in enumerate(group.runs):
-            boxes.append(
-                _box(f"g{g}r{r}", run.path.name, look(g, r, several), key=f"{g}/{r}", of=f"g{g}")
-            )
+            style = look(g, r, several)
+            boxes.append(_box(f"g{g}r{r}", run.path.name, style, key=f"{g}/{r}", of=f"g{g}"))
         parts.append(element("div", *boxes, class_="group"))
     box = element("input", type="checkbox", id="log")
     log = element("label", box, "log scale", class_="choice")
@@ -153,11 +148,8 @@ BANDS = (
 def _data(sections: Sequence[tuple[str, list[page_series.Panel]]], groups: Sequence[Group]) -> Html:
     """Returns what stands under the pointer, as JSON in which no element can end."""
     several = len(groups) > 1
-    found = [
-        [_series_data(s, groups, several) for s in panel.series]
-        for _, inside in sections
-        for panel in inside
-    ]
+    panels = [panel for _, inside in sections for panel in inside]
+    found = [[_series_data(s, groups, several) for s in panel.series] for panel in panels]
     text = json.dumps(found, separators=(",", ":")).replace("<", "\\u003c")
     return element("script", Html(text), type="application/json", id="data")
 
@@ -174,9 +166,7 @@ def _series_data(
         "label": label,
         "look": look(series.group, series.run, several),
         "steps": series.steps,
-        "values": rounded(series.values),
-        "low": rounded(series.low),
-        "high": rounded(series.high),
+        **{name: rounded(getattr(series, name)) for name in ("values", "low", "high")},
     }
 
 
@@ -184,9 +174,9 @@ def _series_data(
 
 
 def _media(runs: Sequence[RunRecord]) -> list[Html]:
-    found: list[Media] = []
+    room, parts = LARGEST_PAGE, list[Html]()
     for run in runs:
-        found.append(read_media(run.path, LARGEST_PAGE - size(found)))
-    named = zip(runs, found, strict=True)
-    parts = [part for run, one in named for part in media_elements(run.path.name, one)]
+        media = read_media(run.path, room)
+        room = media.room
+        parts += media_elements(run.path.name, media)
     return [element("div", join(parts), class_="pictures")] if parts else []

@@ -133,19 +133,13 @@ def _scale(
     """Returns grid and lines of one scale."""
     low, high = around
     bottom = frame.height - frame.bottom
-    up = _linear(low, high, bottom, frame.top)
-    if kind == "log":
-        up = _logarithmic(low, high, bottom, frame.top)
-    marks = log_ticks(low, high) if kind == "log" else ticks(low, high)
-    grid = [
-        part
-        for y in marks
-        for part in (
-            element("line", x1=frame.left, x2=frame.width - frame.right, y1=f"{up(y):.1f}",
-                    y2=f"{up(y):.1f}", class_="grid"),
-            element("text", short(y), x=frame.left - 6, y=f"{up(y) + 4:.1f}", class_="tick beside"),
-        )
-    ]  # fmt: skip
+    between, marks = (_logarithmic, log_ticks) if kind == "log" else (_linear, ticks)
+    up = between(low, high, bottom, frame.top)
+    right, grid = frame.width - frame.right, []
+    for y in marks(low, high):
+        at, below = f"{up(y):.1f}", f"{up(y) + 4:.1f}"
+        grid.append(element("line", x1=frame.left, x2=right, y1=at, y2=at, class_="grid"))
+        grid.append(element("text", short(y), x=frame.left - 6, y=below, class_="tick beside"))
     # Means last, over the runs.
     series = sorted(panel.series, key=lambda s: s.run is None)
     # Where groups have means, their runs step back.

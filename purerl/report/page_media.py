@@ -5,7 +5,6 @@ stranger's folder does not put a file of the reader into it.
 """
 
 import base64
-from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,6 +23,7 @@ class Media(NamedTuple):
 
     files: dict[str, dict[str, bytes]]  # name without suffix -> suffix -> content
     left_out: list[str]  # a line for each
+    room: int  # bytes that the page still takes
 
 
 def read_media(folder: Path, room: int) -> Media:
@@ -33,7 +33,7 @@ def read_media(folder: Path, room: int) -> Media:
       folder: the run's.
       room: how many bytes the page still takes.
     """
-    found = Media({}, [])
+    found = Media({}, [], room)
     names = (folder / "videos").glob("[!.]*.*")
     for path in sorted(names, key=lambda path: (path.stem, path.suffix), reverse=True):
         if path.suffix in KINDS:
@@ -44,7 +44,7 @@ def read_media(folder: Path, room: int) -> Media:
                 continue
             room -= len(content)
             found.files.setdefault(path.stem, {})[path.suffix] = content
-    return found
+    return found._replace(room=room)
 
 
 def _read(folder: Path, path: Path, largest: int) -> bytes:
@@ -55,11 +55,6 @@ def _read(folder: Path, path: Path, largest: int) -> bytes:
     if content[start : start + len(signature)] != signature:
         raise UserError(f"{path} is no {kind}: its first bytes are others.")
     return content
-
-
-def size(media: Iterable[Media]) -> int:
-    """Returns how many bytes the files have."""
-    return sum(len(c) for one in media for files in one.files.values() for c in files.values())
 
 
 def media_elements(title: str, media: Media) -> list[Html]:

@@ -64,11 +64,10 @@ def panels(groups: Sequence[Group]) -> list[tuple[str, list[Panel]]]:
 
 def section_of(metric: str) -> str:
     """Returns the heading under which a metric stands."""
-    return next(
-        title
-        for i, (title, starts) in enumerate(SECTIONS)
-        if (metric in starts if i == 0 else metric.startswith(starts))
-    )
+    (first, exactly), *others = SECTIONS
+    if metric in exactly:
+        return first
+    return next(title for title, starts in others if metric.startswith(starts))
 
 
 def series_of(groups: Sequence[Group], metric: str) -> list[Series]:
@@ -97,16 +96,13 @@ def _run_series(run: RunRecord, metric: str, g: int, r: int, spread: bool) -> Se
         std = visible(run.curve(SPREAD))
         low = [v - std.get(s, 0.0) for s, v in curve.items()]
         high = [v + std.get(s, 0.0) for s, v in curve.items()]
-    shown = spread and low != high
-    return Series(run.path.name, g, r, steps, values, low if shown else None,
-                  high if shown else None)  # fmt: skip
+    band = (low, high) if spread and low != high else (None, None)
+    return Series(run.path.name, g, r, steps, values, *band)
 
 
 def _group_series(group: Group, metric: str, g: int) -> list[Series]:
     curve = learning_curve(group, metric)
-    if curve is None or len(curve.runs) < 2:
-        return []
-    if any(visible(run) != run for run in curve.runs):
+    if curve is None or len(curve.runs) < 2 or any(visible(run) != run for run in curve.runs):
         return []
     iqm, low, high = (None if a is None else [float(v) for v in a] for a in curve.band)
     label = f"{center_name(len(curve.runs))} of {len(curve.runs)}"

@@ -117,10 +117,8 @@ def settings(runs: Sequence[RunRecord], result: dict[str, Any]) -> list[Html]:
         parts.append(table(["what differs", *differ], rows))
     elif len(runs) > 1:
         parts.append(element("p", "The runs differ in no setting but the seed.", class_="note"))
-    parts += [
-        element("p", f"Other conditions: {_cut(line)}", class_="note")
-        for line in result["conditions_that_differ"]
-    ]
+    for line in result["conditions_that_differ"]:
+        parts.append(element("p", f"Other conditions: {_cut(line)}", class_="note"))
     conditions = flatten({k: v for k, v in runs[0].manifest.items() if k != "source"})
     return [
         *parts,

@@ -1,13 +1,20 @@
-"""What every format of an exported policy shares: what it is of, and a check of its actions."""
+"""What every format of an exported policy shares: the policy as a function, a check of its actions.
+
+`jax` and `onnx` files are made of the function.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from purerl.core.records import PyTree
+from purerl.core.records import Array, PyTree
+from purerl.ppo import distributions, running_moments
+from purerl.ppo.episodes import start_memory
 from purerl.report.episode_arrays import record
+from purerl.report.flat_program import flat_program
 from purerl.runs.loaded_run import Run
 
 EPISODES = 8  # that an exported policy is compared on
@@ -66,3 +73,63 @@ def origin(run: Run) -> dict[str, Any]:
     """Returns which policy it is: of what experiment, after how many steps, of what digest."""
     name = run.restored.source.name
     return {"experiment": name, "update": run.update, "steps": run.steps, "digest": run.digest}
+
+
+# --- the policy as a function ---
+
+
+class PolicyFunction(NamedTuple):
+    """A function of batches, and examples of one environment's arguments."""
+
+    act: Callable[[PyTree, PyTree], tuple[Array, PyTree]]  # see `policy_function`
+    observation: PyTree  # leaves [O]
+    memory: PyTree  # leaves [H], as an episode starts: zeros
+
+
+def policy_function(run: Run) -> PolicyFunction:
+    """Returns `act(observation, memory) -> (action, memory)` with leading axes [N, ...].
+
+    Normalization and tanh are inside. Of an observation that is a dict, `act` takes only the
+    entries that the action or the memory depends on: those for the value function are left out.
+    """
+    network, state = run.network, run.state
+    shapes = jax.eval_shape(run.env.reset, jax.random.key(0)).observation
+    everything = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    memory = jax.tree.map(lambda x: x[0], start_memory(state.memory, 1))
+
+    def act(observation: PyTree, memory: PyTree) -> tuple[Array, PyTree]:
+        seen = running_moments.normalize(state.normalizer, observation)
+        output, memory = network.apply(state.params, seen, memory)
+        return distributions.to_action(output.distribution.loc), memory
+
+    if not isinstance(everything, dict):
+        return PolicyFunction(act, everything, memory)
+    read = flat_program(act, everything, memory).read
+    names = [name for number, name in enumerate(sorted(everything)) if number in read]
+    needed = {name: everything[name] for name in names}
+
+    def act_on(observation: dict[str, Any], memory: PyTree) -> tuple[Array, PyTree]:
+        number = next(iter(observation.values())).shape[0]
+        absent = {k: jnp.zeros((number, *x.shape), x.dtype) for k, x in everything.items()}
+        return act(absent | observation, memory)
+
+    return PolicyFunction(act_on, needed, memory)
+
+
+def remembering(
+    policy: PolicyFunction, call: Callable[[PyTree, PyTree], tuple[Any, PyTree]]
+) -> Callable[[Any], np.ndarray]:
+    """Returns a function of the whole observation that carries the memory from call to call."""
+    memory: PyTree = None
+
+    def act(observation: Any) -> np.ndarray:
+        nonlocal memory
+        if isinstance(policy.observation, dict):
+            observation = {name: observation[name] for name in policy.observation}
+        if memory is None:
+            number = jax.tree.leaves(observation)[0].shape[0]
+            memory = jax.tree.map(lambda x: np.zeros((number, *x.shape), x.dtype), policy.memory)
+        action, memory = call(observation, memory)
+        return np.asarray(action)
+
+    return act

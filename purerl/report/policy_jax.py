@@ -8,10 +8,9 @@ import jax
 import numpy as np
 from jax import export
 
-from purerl.core.records import PyTree
 from purerl.machine.files import write_answer
 from purerl.report.flat_program import batched
-from purerl.report.policy_function import PolicyFunction, policy_function
+from purerl.report.policy_file import policy_function, remembering
 from purerl.runs.loaded_run import Run
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
@@ -25,22 +24,3 @@ def write_jax(run: Run, file: Path) -> Callable[[Any], np.ndarray]:
     content = exported.serialize()
     write_answer(file, bytes(content))
     return remembering(policy, export.deserialize(bytearray(content)).call)
-
-
-def remembering(
-    policy: PolicyFunction, call: Callable[[PyTree, PyTree], tuple[Any, PyTree]]
-) -> Callable[[Any], np.ndarray]:
-    """Returns a function of the whole observation that carries the memory from call to call."""
-    memory: PyTree = None
-
-    def act(observation: Any) -> np.ndarray:
-        nonlocal memory
-        if isinstance(policy.observation, dict):
-            observation = {name: observation[name] for name in policy.observation}
-        if memory is None:
-            number = jax.tree.leaves(observation)[0].shape[0]
-            memory = jax.tree.map(lambda x: np.zeros((number, *x.shape), x.dtype), policy.memory)
-        action, memory = call(observation, memory)
-        return np.asarray(action)
-
-    return act

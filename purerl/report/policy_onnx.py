@@ -13,11 +13,9 @@ from onnx import helper
 
 from purerl.core.records import Array, PyTree
 from purerl.machine.files import write_answer
+from purerl.report import policy_file
 from purerl.report.flat_program import batched, flat_program
 from purerl.report.onnx_nodes import OPSET, Nodes
-from purerl.report.policy_file import control_range, origin
-from purerl.report.policy_function import PolicyFunction, policy_function
-from purerl.report.policy_jax import remembering
 from purerl.runs.loaded_run import Run
 
 IR_VERSION = 8  # the file format that goes with the operator set
@@ -29,11 +27,11 @@ def write_onnx(run: Run, file: Path) -> Callable[[Any], np.ndarray]:
     Raises:
       UserError: the network computes what ONNX or this writer has not.
     """
-    policy = policy_function(run)
-    model = build_model(policy, control_range(run), origin(run))
+    policy = policy_file.policy_function(run)
+    model = build_model(policy, policy_file.control_range(run), policy_file.origin(run))
     onnx.checker.check_model(model, full_check=True)
     write_answer(file, model.SerializeToString())
-    return remembering(policy, caller(file))
+    return policy_file.remembering(policy, caller(file))
 
 
 def names(prefix: str, tree: PyTree) -> list[str]:
@@ -44,7 +42,7 @@ def names(prefix: str, tree: PyTree) -> list[str]:
 
 
 def build_model(
-    policy: PolicyFunction, limits: np.ndarray | None, notes: dict[str, Any]
+    policy: policy_file.PolicyFunction, limits: np.ndarray | None, notes: dict[str, Any]
 ) -> onnx.ModelProto:
     """Returns the model: observation and memory in; action, control and the next memory out.
 
@@ -68,13 +66,9 @@ def build_model(
     made = jax.tree.leaves(jax.eval_shape(outputs, *batched(arguments)))
     nodes = Nodes(given)
     nodes.write(program, taken)
-    graph = helper.make_graph(
-        nodes.nodes,
-        "policy",
-        [_info(name, x.shape) for name, x in zip(given, jax.tree.leaves(arguments), strict=True)],
-        [_info(name, x.shape[1:]) for name, x in zip(taken, made, strict=True)],
-        nodes.constants,
-    )
+    read = [_info(n, x.shape) for n, x in zip(given, jax.tree.leaves(arguments), strict=True)]
+    results = [_info(name, x.shape[1:]) for name, x in zip(taken, made, strict=True)]
+    graph = helper.make_graph(nodes.nodes, "policy", read, results, nodes.constants)
     opset = [helper.make_opsetid("", OPSET)]
     model = helper.make_model(graph, opset_imports=opset, ir_version=IR_VERSION)
     helper.set_model_props(model, {name: str(value) for name, value in notes.items()})

@@ -5,7 +5,7 @@ import hashlib
 import os
 import sys
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -62,11 +62,16 @@ class RunRecord(NamedTuple):
         return {n: float(v) for n, v in found.items() if v is not None and abs(v) <= most}
 
 
-def read_runs(arguments: Iterable[Path]) -> list[RunRecord]:
-    """Reads the runs that arguments mean, as `find_runs`.
+def read_runs(arguments: Sequence[Path], command: str) -> list[RunRecord]:
+    """Reads the runs that arguments of a command mean, as `find_runs`.
 
     Where runs agree in all settings and not in their code, the code is one more setting of them.
+
+    Raises:
+      UserError: there are none, or one of them means no run.
     """
+    if not arguments:
+        raise UserError(f"Give the runs to {command}: python -m purerl.{command} RUN RUN ...")
     runs = [read(path) for path in find_runs(arguments)]
     codes = Counter(settings for settings, _ in {(repr(run.settings), run.code) for run in runs})
     several = [codes[repr(run.settings)] > 1 for run in runs]

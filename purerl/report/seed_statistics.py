@@ -177,9 +177,8 @@ def learning_curve(group: Group, metric: str) -> Curve | None:
     A failed run goes on with the last value that it reached, which is its score: it would else end
     the curve of the others.
     """
-    counted = [
-        [run for run in runs if _score(run, metric) is not None] for runs in group.strata.values()
-    ]
+    every = group.strata.values()
+    counted = [[run for run in runs if _score(run, metric) is not None] for runs in every]
     strata = [[run.curve(metric) for run in runs] for runs in counted if runs]
     curves = [curve for found in strata for curve in found]
     sound = [run.curve(metric) for runs in counted for run in runs if run.status != "failed"]

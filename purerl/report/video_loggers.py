@@ -1,6 +1,7 @@
 """Videos for TensorBoard and Weights & Biases, which show what `run --video` made."""
 
 import io
+import itertools
 from pathlib import Path
 
 from PIL import Image
@@ -45,15 +46,10 @@ def log_to_tensorboard(folder: Path, video: Path, update: int) -> None:
     sheet = video.with_suffix(".png")
     with Image.open(sheet) as picture:
         found.append((SHEET, sheet.read_bytes(), picture.size))
-    values = [
-        Summary.Value(
-            tag=name,
-            image=Summary.Image(
-                width=size[0], height=size[1], colorspace=3, encoded_image_string=content
-            ),
-        )
-        for name, content, size in found
-    ]
+    values = []
+    for name, data, (width, height) in found:
+        image = Summary.Image(width=width, height=height, colorspace=3, encoded_image_string=data)
+        values.append(Summary.Value(tag=name, image=image))
     # The writer of the metrics, closed by now, may have a file of the same second.
     writer = FileWriter(str(folder / "tensorboard"), filename_suffix=".video")
     writer.add_summary(Summary(value=values), update)
@@ -69,11 +65,8 @@ def as_gif(video: Path) -> tuple[bytes, tuple[int, int]]:
     width, height = about["size"]
     size = GIF_WIDTH, round(GIF_WIDTH * height / width)
     stride = max(1, round(about["fps"] / GIF_RATE))
-    frames = [
-        Image.frombytes("RGB", (width, height), frame).resize(size)
-        for number, frame in enumerate(reader)
-        if number % stride == 0
-    ]
+    kept = itertools.islice(reader, 0, None, stride)
+    frames = [Image.frombytes("RGB", (width, height), frame).resize(size) for frame in kept]
     content = io.BytesIO()
     milliseconds = round(1000 * stride / about["fps"])
     frames[0].save(

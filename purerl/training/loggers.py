@@ -3,7 +3,6 @@
 TensorBoard and W&B have threads of their own, for which training never waits.
 """
 
-import importlib.util
 import math
 import queue
 import threading
@@ -12,9 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import purerl
-from purerl.core.errors import UserError, one_line
+from purerl.core.errors import one_line
 from purerl.experiment.options import RunOptions
+from purerl.machine.command_errors import check_installed
 from purerl.machine.output import Say
 from purerl.runs.folder import Folder
 from purerl.runs.metrics_file import Record, read_metrics
@@ -113,9 +112,8 @@ def check_loggers(options: RunOptions) -> None:
     """Raises UserError, with the line to paste, unless the packages of loggers are there."""
     asked = {"tensorboardX": options.tensorboard, "wandb": options.wandb != "off"}
     for package, wanted in asked.items():
-        if wanted and importlib.util.find_spec(package) is None:
-            line = purerl.how_to_install(package.removesuffix("X"))
-            raise UserError(f"The package {package} is not installed; run: {line}")
+        if wanted:
+            check_installed(package, package.removesuffix("X"))
 
 
 def open_loggers(options: RunOptions, folder: Folder, say: Say) -> list[BackgroundLogger]:

@@ -55,8 +55,7 @@ def train_command(name: str, written: Experiment, chosen: Experiment, env: Any) 
       chosen: the run's, whose other settings are kept.
       env: the environment's options.
     """
-    parts = {n: v for n, v in settings_of(chosen).items() if dataclasses.is_dataclass(v)} | {
-        ENV: env
-    }
+    parts = {n: v for n, v in settings_of(chosen).items() if dataclasses.is_dataclass(v)}
+    parts[ENV] = env
     words = [w for n, v in parts.items() for w in option_words(n, getattr(written, n), v)]
     return shlex.join(["python", "-m", "purerl.run", name, *words])

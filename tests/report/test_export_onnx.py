@@ -13,7 +13,7 @@ onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
 
 from purerl.report import onnx_nodes, policy_onnx  # noqa: E402
-from purerl.report.policy_function import PolicyFunction, policy_function  # noqa: E402
+from purerl.report.policy_file import PolicyFunction, policy_function  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

@@ -1,7 +1,5 @@
 """What planned episodes were like, in figures: returns, every metric, both rewards."""
 
-import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -59,25 +57,21 @@ def said(values: np.ndarray | None) -> str:
 def rows(groups: Mapping[str, Figures]) -> str:
     """Returns CSV: a row for each episode of each group."""
     names = dict.fromkeys(name for figures in groups.values() for name in figures)
-    written = io.StringIO()
-    writer = csv.DictWriter(written, ["settings", "episode", *names], lineterminator="\n")
-    writer.writeheader()
+    found = []
     for group, figures in groups.items():
         for episode in range(len(figures[LENGTH])):
             values = {name: float(values[episode]) for name, values in figures.items()}
-            writer.writerow({"settings": group, "episode": episode} | values)
-    return written.getvalue()
+            found.append({"settings": group, "episode": episode} | values)
+    return comparison.csv_text(["settings", "episode", *names], found, "\n")
 
 
 def as_json(groups: Mapping[str, Figures], about: Mapping[str, Any]) -> str:
     """Returns JSON: what was asked for, and every figure with its values, mean and interval."""
-    found = {
-        group: {
-            name: {"mean": float(x.mean()), "interval": mean_interval(x), "values": x.tolist()}
-            for name, x in figures.items()
-        }
-        for group, figures in groups.items()
-    }
+
+    def one(x: np.ndarray) -> dict[str, Any]:
+        return {"mean": float(x.mean()), "interval": mean_interval(x), "values": x.tolist()}
+
+    found = {group: {n: one(x) for n, x in figures.items()} for group, figures in groups.items()}
     return json.dumps({**about, "figures": found}, indent=2, default=str) + "\n"
 
 
@@ -91,14 +85,13 @@ def judged(rows: Sequence[Mapping[str, Any]]) -> Figures:
     for judge in rows[0]["judged"]:
         told = {k: np.concatenate([row["judged"][judge][k] for row in rows])
                 for k in rows[0]["judged"][judge]}  # fmt: skip
-        over = told.pop("over")
-        counts = running & (np.cumsum(over, axis=0) - over == 0)
+        ends = told.pop("over")
+        counts = running & (np.cumsum(ends, axis=0) - ends == 0)
         length = counts.sum(axis=0)
         for part, values in told.items():
             whole = np.where(counts, values, 0.0).sum(axis=0, dtype=float)
-            found[f"{part} under {judge}"] = (
-                whole if part == "return" else whole / np.maximum(length, 1)
-            )
+            over = 1 if part == "return" else np.maximum(length, 1)
+            found[f"{part} under {judge}"] = whole / over
         found[f"steps under {judge}"] = length.astype(float)
     return found
 

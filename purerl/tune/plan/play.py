@@ -4,18 +4,21 @@ import dataclasses
 import functools
 import operator
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from purerl.checks.user_code import users_errors
+from purerl.core.env import Env
 from purerl.core.errors import StoppedError
 from purerl.experiment.objects import naming_broken_rules
 from purerl.machine import output
-from purerl.report.episode_pictures import take_picture
+from purerl.report.episode_pictures import recording_of, take_picture
+from purerl.report.video import draw, renderer_of
 from purerl.tune.plan import episodes, figures, planner
-from purerl.tune.plan.filming import film
 
 FRAME = (640, 480)  # of a video [pixels]
 SAY = 10.0  # between two lines about how it goes [s]
@@ -69,10 +72,26 @@ def play(problem: Any, options: Any, judges: dict[str, Any], stop: Callable[[], 
     if options.video is not None:
         name = f"{options.video.stem}_{problem.title}" if judges else options.video.stem
         path = options.video.with_name(f"{name}.mp4")
-        film(path, env, FRAME, now, rows)
+        film(path, env, now, rows)
         output.say(str(path))
     starts = jax.tree.map(lambda x: x[0], rows[0]["kept"])
     return Played(episodes.results(now), figures.judged(rows), starts)
+
+
+def film(path: Path, env: Env, end: episodes.Playing, rows: Sequence[dict[str, Any]]) -> None:
+    """Writes a video of episodes, drawn as those of a run's policy are.
+
+    Args:
+      path: of the mp4.
+      env: the environment.
+      end: the episodes, over.
+      rows: of `episodes.episodes`, with pictures kept.
+    """
+    kept = [(row["kept"], row["running"]) for row in rows]
+    pictures, running = jax.tree.map(lambda *parts: np.concatenate(parts), *kept)
+    recording = jax.device_get(recording_of(env, pictures, running, end.progress))
+    with renderer_of(env, FRAME) as renderer:
+        draw(path, renderer, recording, env.control_timestep)
 
 
 def wait(arrays: Any) -> None:

@@ -41,13 +41,10 @@ class PlanCommandOptions(PlanOptions):
         """Checks the rules."""
         super().__post_init__()
         check_least(self, ValueError, episodes=1, steps=0)
-        for name in ("csv", "json", "video"):
-            file = getattr(self, name)
-            if file is None:
-                continue
-            if file.is_dir():
+        for name, file in (("csv", self.csv), ("json", self.json), ("video", self.video)):
+            if file and file.is_dir():
                 raise ValueError(f"{name} is {file}, a folder; it must be a file.")
-            if not os.access(file.absolute().parent, os.W_OK):
+            if file and not os.access(file.absolute().parent, os.W_OK):
                 raise ValueError(
                     f"{name} is {file}; it must be a file in a folder that exists and is yours."
                 )

@@ -63,11 +63,6 @@ class SweepOptions:
     dry_run: bool = False
     """Check everything, print the commands, and start none."""
 
-    @property
-    def swept(self) -> list[str]:
-        """What is swept, SETTING=VALUES; an option without any is a text without any."""
-        return [text for texts in self.grid or self.over for text in texts or ("",)]
-
 
 OWN = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(SweepOptions)}
 

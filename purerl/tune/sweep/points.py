@@ -1,8 +1,8 @@
 """The points of a sweep: settings as words of `python -m purerl.run`, checked before it begins."""
 
 import dataclasses
-import shlex
-from collections.abc import Iterable, Mapping, Sequence
+import functools
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -92,17 +92,15 @@ def _names(value: Any, path: str = "") -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, inner in settings_json.settings_of(value).items():
         name = path + name.replace("_", "-")
-        is_settings = dataclasses.is_dataclass(inner) and not isinstance(inner, type)
-        found |= _names(inner, f"{name}.") if is_settings else {name: inner}
+        deeper = settings_json.has_settings(inner)
+        found |= _names(inner, f"{name}.") if deeper else {name: inner}
     return found
 
 
 def read_value(base: Base, name: str, text: str) -> Any:
     """Returns a setting's value of the type that it has; UserError if it is of another."""
     *path, last = name.replace("-", "_").split(".")
-    owner: Any = base.chosen
-    for part in path:
-        owner = getattr(owner, part)
+    owner: Any = functools.reduce(getattr, path, base.chosen)
     kind = hints(type(owner)).get(last, type(getattr(owner, last)))
     # A class with this setting alone: rules that join several settings come later, in `check`.
     one: Any = Annotated[kind, tyro.conf.arg(name=name)]
@@ -132,7 +130,12 @@ def typed_values(base: Base, points: Sequence[Point]) -> list[dict[str, Any]]:
 def check_all(base: Base, points: Sequence[Point]) -> None:
     """Raises UserError if the settings of a point break a rule together."""
     for point, typed in zip(points, typed_values(base, points), strict=True):
-        _check(base, point.values, typed)
+        places = {Place(n.replace("-", "_").split(".")): x for n, x in typed.items()}
+        try:
+            replaced(base.chosen, places)
+        except Exception as error:  # a rule of a dataclass, of ours or the user's
+            shown = " ".join(f"{name}={text}" for name, text in point.values.items())
+            raise UserError(f"The point {shown}: {one_line(error)}") from error
 
 
 def check_evaluated(base: Base, spaces: Sequence[Space], metric: str) -> None:
@@ -145,17 +148,6 @@ def check_evaluated(base: Base, spaces: Sequence[Space], metric: str) -> None:
             f"{name} is 0, and a point without an evaluation has no {metric}; give at least 1, or "
             "another --metric, such as train/episode_return."
         )
-
-
-def _check(base: Base, values: Values, typed: Mapping[str, Any]) -> None:
-    places: dict[Place, Any] = {
-        tuple(name.replace("-", "_").split(".")): value for name, value in typed.items()
-    }
-    try:
-        replaced(base.chosen, places)
-    except Exception as error:  # a rule of a dataclass, of ours or the user's
-        shown = " ".join(f"{name}={text}" for name, text in values.items())
-        raise UserError(f"The point {shown}: {one_line(error)}") from error
 
 
 def option_words(base: Base, name: str, text: str) -> list[str]:
@@ -182,8 +174,3 @@ def job(base: Base, point: Point) -> Job:
         names = [f"{point.name}-seed{first + i}" for i in range(base.seeds)]
     folders = tuple(base.folder / base.source.name / name for name in names)
     return Job(point.name, tuple(words), folders, base.folder / "logs" / f"{point.name}.log")
-
-
-def command(one: Job) -> str:
-    """Returns a job as a line for a shell."""
-    return shlex.join(["python", "-m", "purerl.run", *one.words])

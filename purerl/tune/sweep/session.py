@@ -1,8 +1,10 @@
 """Carries a sweep out: its folder, its runs, its table."""
 
 import contextlib
+import functools
 import hashlib
 import itertools
+import shlex
 from collections.abc import Container, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,12 +13,13 @@ from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, UserError
 from purerl.experiment.loading import Source
 from purerl.experiment.settings_json import to_json
 from purerl.experiment.source_hashes import PACKAGE, source_hashes
+from purerl.machine.command_errors import check_installed
 from purerl.machine.files import check_object, make_folder, read_json, write_json, writing
 from purerl.machine.lock import FolderLock
 from purerl.machine.output import say, show, warn
 from purerl.runs import folder as run_folder, manifest
-from purerl.tune.sweep import picture, points, scheduler, slurm, spaces, study, table
-from purerl.tune.sweep.options import SweepOptions, read
+from purerl.tune.sweep import points, scheduler, slurm, spaces, study, table
+from purerl.tune.sweep.options import SweepOptions, read as read_command
 from purerl.tune.sweep.points import Base, Point
 from purerl.tune.sweep.scheduler import Ended, Job
 from purerl.tune.sweep.spaces import Space
@@ -33,19 +36,21 @@ class Sweep(NamedTuple):
 
 def execute(arguments: Sequence[str]) -> int:
     """Checks the whole command, then carries it out; returns the exit code."""
-    options, base, given = read(arguments)
-    swept = points.read_spaces(base, options.swept, given)
+    options, base, given = read_command(arguments)
+    # An option without any SETTING=VALUES is a text without any.
+    texts = [text for texts in options.grid or options.over for text in texts or ("",)]
+    swept = points.read_spaces(base, texts, given)
     points.check_evaluated(base, swept, options.metric)
     sweep = Sweep(options, base, swept, [])
     if options.optuna:
         spaces.check_number("optuna", options.optuna)
-        study.check_installed("optuna")
+        check_installed("optuna", "sweep")
     else:
         drawn = spaces.draw(swept, options.random) if options.random else spaces.grid(swept)
         sweep.points.extend(Point(number, values) for number, values in enumerate(drawn))
         points.check_all(base, sweep.points)
     if options.slurm:
-        study.check_installed("submitit")
+        check_installed("submitit", "sweep")
         slurm.check(options.slurm)
     if options.dry_run:
         return _show_commands(sweep)
@@ -58,7 +63,9 @@ def _show_commands(sweep: Sweep) -> int:
     if sweep.options.optuna:
         first = study.propose(study.open_study(None), sweep.spaces, sweep.options.optuna)
         shown = list(itertools.islice(first, study.FIRST))
-    show(*(points.command(points.job(sweep.base, point)) for point in shown))
+    for point in shown:
+        job = points.job(sweep.base, point)
+        show(shlex.join(["python", "-m", "purerl.run", *job.words]))
     if sweep.options.optuna > len(shown):
         show(f"# The other {sweep.options.optuna - len(shown)} points depend on scores.")
     return SUCCESS
@@ -76,7 +83,8 @@ def _begin(sweep: Sweep) -> Iterator[None]:
         make_folder(folder)
         if not file.exists() and any(not one.name.startswith(".") for one in folder.iterdir()):
             raise UserError(f"{folder} holds no sweep, but other files; use another --name.")
-        lock = _lock(folder)
+        held = f"The sweep {folder} is being carried out by another process"
+        lock = FolderLock(folder, held=held)
     with contextlib.closing(lock):
         described = _describe(sweep)
         if file.exists():
@@ -86,16 +94,6 @@ def _begin(sweep: Sweep) -> Iterator[None]:
             _check_code(sweep.base, begun["source"], described["source"])
         write_json(file, described)
         yield
-
-
-def _lock(folder: Path) -> FolderLock:
-    try:
-        return FolderLock(folder)
-    except UserError as error:
-        raise UserError(
-            f"The sweep {folder} is being carried out by another process; stop that one first, or "
-            "use another --name."
-        ) from error
 
 
 def _check_same(folder: Path, begun: dict[str, Any], now: dict[str, Any]) -> None:
@@ -117,9 +115,8 @@ def _check_code(base: Base, begun: dict[str, Any], now: dict[str, str]) -> None:
     changed = [name for name in begun if now.get(name, begun[name]) != begun[name]]
     if not changed or base.options.allow_changes:
         return
-    if any(
-        run_folder.read(folder).is_begun for folder in (base.folder / base.source.name).glob("*")
-    ):
+    runs = (base.folder / base.source.name).glob("*")
+    if any(run_folder.read(run).is_begun for run in runs):
         more = f" and {len(changed) - 1} more" if changed[1:] else ""
         raise UserError(
             f"The experiment's code has changed since the sweep {base.folder} began: {changed[0]}"
@@ -143,14 +140,12 @@ def _code(source: Source) -> dict[str, str]:
 def _describe(sweep: Sweep) -> dict[str, Any]:
     """Returns what makes a sweep another one; of drawn points their number does not."""
     options, base = sweep.options, sweep.base
-    values = {
-        space.setting: spaces.as_json(
-            space, lambda text, name=space.setting: to_json(points.read_value(base, name, text))
-        )
-        for space in sweep.spaces
-    }
+    swept = {}
+    for space in sweep.spaces:
+        read = functools.partial(points.read_value, base, space.setting)
+        swept[space.setting] = spaces.as_json(space, lambda text, read=read: to_json(read(text)))
     how = "random" if options.random else "optuna" if options.optuna else "grid"
-    found = {"experiment": base.source.name, "settings": to_json(base.chosen), "swept": values}
+    found = {"experiment": base.source.name, "settings": to_json(base.chosen), "swept": swept}
     found |= {"points": how, "seeds": options.seeds}
     # Options of the runs that alter their bits, or the steps that a line of metrics is about.
     found |= {n: getattr(base.options, n) for n in ("portable", "num_shards", "log_every")}
@@ -167,12 +162,10 @@ class _Progress:
 
     def __init__(self, sweep: Sweep) -> None:
         self.sweep = sweep
-        self.points = {point.name: point for point in sweep.points}
         self.number = sweep.options.optuna or len(sweep.points)
         self.study = study.open_study(sweep.base.folder) if sweep.options.optuna else None
-        if self.study is not None:
-            known = study.known(self.study, sweep.spaces)
-            self.points = {point.name: point for point in known}
+        known = study.known(self.study, sweep.spaces) if self.study else sweep.points
+        self.points = {point.name: point for point in known}
         self.results: list[Ended] = []
         self.begun: set[str] = set()  # by this command
 
@@ -247,9 +240,5 @@ def _report(sweep: Sweep, chosen: Sequence[Point], queued: Container[str] = ()) 
     metric, folder = sweep.options.metric, sweep.base.folder
     rows = table.make_rows(sweep.base, chosen, metric, queued)
     lines = table.describe(rows, sweep.spaces, metric)
-    files = list(table.write(folder, rows, sweep.spaces, lines).values())
-    drawn = folder / "sweep.png"
-    if picture.draw(drawn, rows, sweep.spaces, metric):
-        files.append(drawn)
-    show(*lines, *map(str, files))
+    show(*lines, *map(str, table.write(folder, rows, sweep.spaces, metric, lines)))
     return rows

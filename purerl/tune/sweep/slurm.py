@@ -20,16 +20,12 @@ DEAF = ("sh", "-c", 'trap "" USR1 USR2; exec "$@"', "sh")
 
 
 class Task:
-    """What a task of the array does; submitit pickles it."""
+    """What a task of the array does; submitit pickles it before it is called."""
 
     def __init__(self, job: Job) -> None:
         """Keeps the job."""
         self.job = job
         self.process: subprocess.Popen | None = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leaves the process out: another machine has no use for it."""
-        return {"job": self.job, "process": None}
 
     def __call__(self) -> str:
         """Carries the job out, or goes on with it; returns how it ended."""
@@ -103,11 +99,7 @@ def submit(
     file = place / IDS
     known = read_json(file) if file.exists() else {}
     open_ones = [job for job in jobs if not is_done(job)]
-    todo = [
-        job
-        for job in open_ones
-        if not (is_locked(job) or _is_queued(place, cluster, known.get(job.name)))
-    ]
+    todo = [job for job in open_ones if not _is_under_way(job, place, cluster, known)]
     if todo:
         try:
             submitted = executor.submit_array([Task(job) for job in todo])
@@ -118,10 +110,12 @@ def submit(
     return [job.name for job in todo], [job.name for job in open_ones if job not in todo]
 
 
-def _is_queued(place: Path, cluster: Any, job_id: str | None) -> bool:
+def _is_under_way(job: Job, place: Path, cluster: str, known: dict[str, str]) -> bool:
     """Tells whether SLURM has the job, waiting or running; here its id is that of a process."""
-    if job_id is None or cluster == "local":
-        return job_id is not None and Path("/proc", job_id).exists()
+    if (locked := is_locked(job)) or job.name not in known:
+        return locked
+    if cluster == "local":
+        return Path("/proc", known[job.name]).exists()
     from submitit import SlurmJob
 
-    return not SlurmJob(place, job_id).done(force_check=True)
+    return not SlurmJob(place, known[job.name]).done(force_check=True)

@@ -8,7 +8,7 @@ log:1e-5:1e-2   the same, the logarithm drawn evenly
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,34 +52,31 @@ def parse_space(setting: str, text: str, whole: bool) -> Space:
       UserError: it is neither, or a range is empty.
     """
     log = text.startswith("log:")
-    low, separator, high = text.removeprefix("log:").partition(":" if log else "..")
-    if not log and not (separator and (_is_number(low) or _is_number(high))):
+    first, separator, last = text.removeprefix("log:").partition(":" if log else "..")
+    low, high = _number(first), _number(last)
+    if not log and (not separator or (math.isnan(low) and math.isnan(high))):
         choices = tuple(" ".join(part.split()) for part in text.split(",") if part.strip())
         if not choices:
             raise UserError(f"{setting} has no value; give it as {setting}=1,2,3.")
         return Space(setting, choices)
-    try:
-        ends = float(low), float(high)
-    except ValueError:
-        ends = math.nan, math.nan
-    if not all(map(math.isfinite, ends)):
+    if not (math.isfinite(low) and math.isfinite(high)):
         raise UserError(
             f"{setting} is {text}; a range is two numbers, as {setting}=1..8 or {setting}=log:1:8."
         )
-    if whole and any(not end.is_integer() for end in ends):
+    if whole and not (low.is_integer() and high.is_integer()):
         raise UserError(f"{setting} is {text}; it is a whole number, and so must both ends be.")
-    if ends[0] >= ends[1] or (log and ends[0] <= 0):
+    if low >= high or (log and low <= 0):
         rule = "the lower end must come first" + " and be above 0" * log
         raise UserError(f"{setting} is {text}; {rule}.")
-    return Space(setting, (), *ends, whole, log)
+    return Space(setting, (), low, high, whole, log)
 
 
-def _is_number(text: str) -> bool:
+def _number(text: str) -> float:
+    """Returns what a text says, NaN where it is no number."""
     try:
-        float(text)
+        return float(text)
     except ValueError:
-        return False
-    return True
+        return math.nan
 
 
 def grid(spaces: Sequence[Space]) -> list[Values]:
@@ -94,20 +91,15 @@ def grid(spaces: Sequence[Space]) -> list[Values]:
                 f"{space.setting} is a range, of which a grid would take no end of values; list "
                 "some, or draw them: --random 20 --over " + _shown(space)
             )
-    number = math.prod(
-        len(space.choices) or round(space.high - space.low) + 1 for space in spaces
-    )  # before any list is made
-    if number > MOST_POINTS:
-        raise UserError(
+    sizes = (len(space.choices) or round(space.high - space.low) + 1 for space in spaces)
+    if (number := math.prod(sizes)) > MOST_POINTS:
+        raise UserError(  # before any list is made
             f"The grid has {number:,} points, of at most {MOST_POINTS:,}; leave values out, or "
             "draw some of them with --random and --over."
         )
-    each = [
-        space.choices or [str(n) for n in range(round(space.low), round(space.high) + 1)]
-        for space in spaces
-    ]
+    every = [x.choices or map(str, range(round(x.low), round(x.high) + 1)) for x in spaces]
     names = [space.setting for space in spaces]
-    return [dict(zip(names, values, strict=True)) for values in itertools.product(*each)]
+    return [dict(zip(names, values, strict=True)) for values in itertools.product(*every)]
 
 
 def _shown(space: Space) -> str:
@@ -122,30 +114,23 @@ def draw(spaces: Sequence[Space], number: int) -> list[Values]:
       UserError: there are not so many different points, or more than `MOST_POINTS`.
     """
     check_number("random", number)
-    return list(itertools.islice(_draws(spaces), number))
+    generator, found, tries = np.random.default_rng(0), dict[tuple[str, ...], Values](), 0
+    while len(found) < number:
+        if tries > MOST_TRIES:
+            raise UserError(
+                f"Only {len(found)} different points can be drawn; lower --random, or take them "
+                "all with --grid."
+            )
+        point = {space.setting: _draw_one(space, generator) for space in spaces}
+        tries = tries + 1 if tuple(point.values()) in found else 0
+        found[tuple(point.values())] = point
+    return list(found.values())
 
 
 def check_number(option: str, number: int) -> None:
     """Raises UserError unless a number of points can be carried out."""
     if not 1 <= number <= MOST_POINTS:
         raise UserError(f"{option} is {number:,}; it must be from 1 to {MOST_POINTS:,} points.")
-
-
-def _draws(spaces: Sequence[Space]) -> Iterator[Values]:
-    generator, seen = np.random.default_rng(0), set[tuple[str, ...]]()
-    tries = 0
-    while True:
-        point = {space.setting: _draw_one(space, generator) for space in spaces}
-        tries += 1
-        if tuple(point.values()) not in seen:
-            seen.add(tuple(point.values()))
-            tries = 0
-            yield point
-        if tries > MOST_TRIES:
-            raise UserError(
-                f"Only {len(seen)} different points can be drawn; lower --random, or take them all "
-                "with --grid."
-            )
 
 
 def _draw_one(space: Space, generator: np.random.Generator) -> str:

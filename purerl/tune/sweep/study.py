@@ -1,6 +1,5 @@
 """Points that Optuna chooses by the scores so far; its own storage keeps them in the folder."""
 
-import importlib.util
 import sqlite3
 import warnings
 from collections.abc import Iterator, Sequence
@@ -8,20 +7,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import purerl
-from purerl.core.errors import UserError
 from purerl.tune.sweep.points import Point
 from purerl.tune.sweep.spaces import Space
 
 FILE = "optuna.db"
 FIRST = 10  # points that Optuna's sampler draws before it looks at scores
-
-
-def check_installed(package: str) -> None:
-    """Raises UserError, with the line to paste, unless a package of the extra is there."""
-    if importlib.util.find_spec(package) is None:
-        line = purerl.how_to_install("sweep")
-        raise UserError(f"The package {package} is not installed; run: {line}")
 
 
 def open_study(folder: Path | None) -> Any:

@@ -1,12 +1,16 @@
-"""What came of a sweep: a row for each point, best first, as text and as CSV."""
+"""What came of a sweep: a row for each point, best first, as text, as CSV and as a picture."""
 
+import contextlib
 import numbers
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from purerl.core.errors import UserError
 from purerl.machine.files import writing
+from purerl.machine.output import printable
 from purerl.report import comparison, run_reader
 from purerl.report.seed_statistics import Group, check_scored, summarize
 from purerl.tune.sweep.points import Base, Point, job, typed_values
@@ -15,6 +19,8 @@ from purerl.tune.sweep.spaces import Space
 
 # A score of a part of the seeds, or of a part of the training, comes after whole ones.
 ORDER = ("done", "training", "stopped", "waiting", "failed")
+COLUMNS = 3  # of the picture
+SPREAD = 10.0  # of listed values, largest / smallest, from which their axis is logarithmic
 
 
 class Row(NamedTuple):
@@ -52,10 +58,8 @@ def group_of(base: Base, point: Point) -> Group:
     """Returns the runs of a point that can be read, as `compare` groups runs."""
     runs = []
     for folder in job(base, point).folders:
-        try:
+        with contextlib.suppress(UserError):  # not begun
             runs.append(run_reader.read(folder))
-        except UserError:  # not begun
-            continue
     return Group(point.name, runs, {"": runs})
 
 
@@ -92,16 +96,10 @@ def is_number(value: Any) -> bool:
 
 def as_record(row: Row) -> dict[str, Any]:
     """Returns a row as columns."""
-    interval = row.summary["interval"] or {"low": None, "high": None}
-    names = ("n", "score", "mean", "worst")
-    return {
-        "point": row.point.name,
-        **row.point.values,
-        **{name: row.summary[name] for name in names},
-        **interval,
-        "status": row.status,
-        "said": row.said,
-    }
+    found = {name: row.summary[name] for name in ("n", "score", "mean", "worst")}
+    found |= row.summary["interval"] or {}
+    about = {"status": row.status, "said": row.said}
+    return {"point": row.point.name} | row.point.values | found | about
 
 
 def describe(rows: Sequence[Row], spaces: Sequence[Space], metric: str) -> list[str]:
@@ -137,13 +135,94 @@ def _shown(text: str) -> str:
 
 
 def write(
-    folder: Path, rows: Sequence[Row], spaces: Sequence[Space], lines: Sequence[str]
-) -> Mapping[str, Path]:
-    """Writes sweep.csv and sweep.txt; returns them by their kind."""
-    files = {kind: folder / f"sweep.{kind}" for kind in ("csv", "txt")}
+    folder: Path, rows: Sequence[Row], spaces: Sequence[Space], metric: str, lines: Sequence[str]
+) -> list[Path]:
+    """Writes sweep.csv, sweep.txt and, if a point has a score, sweep.png; returns them."""
+    sheet, text, drawn = (folder / f"sweep.{kind}" for kind in ("csv", "txt", "png"))
     names = ["point", *(space.setting for space in spaces)]
     names += ["n", "score", "low", "high", "mean", "worst", "status", "said"]
     with writing(folder):
-        comparison.write_csv(files["csv"], names, map(as_record, rows))
-        files["txt"].write_text("\n".join(lines) + "\n", errors="backslashreplace")
-    return files
+        comparison.write_csv(sheet, names, map(as_record, rows))
+        text.write_text("\n".join(lines) + "\n", errors="backslashreplace")
+    return [sheet, text, *([drawn] if draw(drawn, rows, spaces, metric) else [])]
+
+
+# --- the picture: the score over each swept setting ---
+
+
+def has_log_axis(space: Space, values: Sequence[Any]) -> bool:
+    """Tells whether a setting is shown on a logarithmic axis."""
+    if not space.choices:
+        return space.log
+    return all(map(is_number, values)) and min(values) > 0 and max(values) >= SPREAD * min(values)
+
+
+def draw(path: Path, rows: Sequence[Row], spaces: Sequence[Space], metric: str) -> bool:
+    """Writes the picture; returns False, and writes none, if no point has a score.
+
+    Args:
+      path: the PNG.
+      rows: the points, the best one first.
+      spaces: the swept settings, each a panel.
+      metric: the score's name.
+    """
+    rows = [row for row in rows if row.summary["score"] is not None]
+    if not rows:
+        return False
+    columns = min(COLUMNS, len(spaces))
+    lines = -(-len(spaces) // columns)
+    size = (4.5 * columns + 1, 3.6 * lines)
+    with comparison.picture(path, lines, columns, figsize=size, sharey=True, squeeze=False) as (
+        figure,
+        axes,
+    ):
+        for panel, space in zip(axes.flat, spaces, strict=False):
+            _draw_panel(panel, rows, space)
+        for panel in axes.flat[len(spaces) :]:
+            panel.set_axis_off()
+        for panel in axes[:, 0]:
+            panel.set_ylabel(printable(metric))
+        legends = (panel.get_legend_handles_labels() for panel in axes.flat)
+        handles = max(legends, key=lambda legend: len(legend[0]))
+        figure.legend(*handles, loc="outside lower center", ncols=4, fontsize="small")
+    return True
+
+
+def _draw_panel(panel: Any, rows: Sequence[Row], space: Space) -> None:
+    """Draws a point's seeds, its score and interval; the line joins the medians of each value."""
+    values = [row.typed[space.setting] for row in rows]
+    names = sorted({str(value): value for value in values}.values(), key=by_value)
+    numbers = all(map(is_number, values))
+    place = [float(v) if numbers else float(names.index(v)) for v in values]
+    scores = [row.summary["score"] for row in rows]
+    both = list(zip(place, rows, strict=True))
+    seeds = [(x, y) for x, row in both for y in row.summary["runs"].values()]
+    panel.plot(*zip(*seeds, strict=True), ".", color="0.7", markersize=4, label="one seed")
+    for x, row in both:
+        if row.summary["interval"]:
+            ends = row.summary["interval"]
+            panel.plot([x, x], [ends["low"], ends["high"]], color="C0", linewidth=1.5, alpha=0.5)
+    panel.plot(place, scores, "o", color="C0", markersize=6, label="score of a point, 95% interval")
+    if rows[0].status == "done":
+        panel.plot(place[0], scores[0], "o", color="C1", markersize=9, label="best point")
+    different = sorted(set(place))
+    if space.choices and len(different) < len(place):
+        medians = [np.median([y for x, y in zip(place, scores, strict=True) if x == one])
+                   for one in different]  # fmt: skip
+        panel.plot(different, medians, color="C0", linewidth=1, label="median of the points")
+    panel.set_xlabel(printable(space.setting))
+    panel.grid(alpha=0.3)
+    if numbers and has_log_axis(space, values):
+        panel.set_xscale("log")
+        # Matplotlib's own labels of decades need its mathematics.
+        panel.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
+        panel.xaxis.set_minor_formatter(lambda x, _: "")
+    if not numbers or (space.choices and len(names) <= 8):  # the values themselves, no others
+        panel.set_xticks(different, [_label(name) for name in names])
+        panel.minorticks_off()
+
+
+def _label(value: Any) -> str:
+    if isinstance(value, tuple | list):
+        return " ".join(map(_label, value))
+    return f"{value:.4g}" if isinstance(value, float) else printable(str(value))[:24]

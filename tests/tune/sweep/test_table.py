@@ -6,7 +6,7 @@ import pytest
 
 from purerl.experiment.loading import find_source
 from purerl.experiment.options import RunOptions
-from purerl.tune.sweep import picture, table
+from purerl.tune.sweep import table
 from purerl.tune.sweep.points import Base, Point
 from purerl.tune.sweep.spaces import parse_space
 from purerl.tune.sweep.table import Row, by_value
@@ -45,11 +45,11 @@ def test_the_best_whole_point_is_first_and_what_has_no_score_last():
 def test_axes_are_logarithmic_where_values_are():
     ranges = {"log:1e-5:1e-2": True, "0.1..100": False}
     for text, is_log in ranges.items():
-        assert picture.has_log_axis(parse_space("x", text, False), [1.0]) is is_log
+        assert table.has_log_axis(parse_space("x", text, False), [1.0]) is is_log
     listed = parse_space("x", "1,2", False)
-    assert picture.has_log_axis(listed, [1e-4, 1e-3])
+    assert table.has_log_axis(listed, [1e-4, 1e-3])
     for values in ([1, 2, 3], [0, 1, 100], ["a", "b"], [(8,), (800,)]):
-        assert not picture.has_log_axis(listed, values)
+        assert not table.has_log_axis(listed, values)
 
 
 @pytest.mark.slow
@@ -60,9 +60,9 @@ def test_any_kind_of_value_is_drawn(tmp_path):
         row(1, 1.0, rate=1e-4, widths=(16,), kind="b", one=1),
         row(2, None, "failed", rate=1e-2, widths=(), kind="c", one=1),
     ]
-    assert picture.draw(tmp_path / "a.png", rows, spaces, "eval/x")
+    assert table.draw(tmp_path / "a.png", rows, spaces, "eval/x")
     assert (tmp_path / "a.png").stat().st_size > 5000
-    assert not picture.draw(tmp_path / "b.png", rows[2:], spaces, "eval/x")
+    assert not table.draw(tmp_path / "b.png", rows[2:], spaces, "eval/x")
 
 
 def test_digits_are_few_and_what_has_no_run_brings_no_note():
