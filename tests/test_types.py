@@ -11,6 +11,7 @@ import sys
 import textwrap
 import typing
 import venv
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -185,6 +186,7 @@ def test_the_options_of_train_are_those_of_the_command():
     del fields["video"], fields["num_seeds"]  # the command's alone; an argument of its own
     of_experiment = typing.get_type_hints(purerl.Experiment)
     fields |= {name: of_experiment[name] for name in ("seed", "engine")}
+    fields["on_metrics"] = Callable[[dict[str, typing.Any]], typing.Any]  # of Python alone
     assert typing.get_type_hints(TrainOptions) == fields
 
 

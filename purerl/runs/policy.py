@@ -25,7 +25,7 @@ class Policy:
     (3, 1)
     """
 
-    def __init__(self, env: Env, network: Network, state: TrainState, run: Any = None) -> None:
+    def __init__(self, env: Env, network: Network, state: TrainState, run: object = None) -> None:
         """Prepares a policy at the start of an episode.
 
         Args:
