@@ -427,5 +427,5 @@ def test_a_memory_that_never_changes():
 def test_an_update_is_timed_of_no_more_steps_than_time_allows(minibatches, seconds, steps):
     """8 environments; 12 minibatches have whole ones of each three steps."""
     length = 20 if minibatches == 8 else 21
-    config = Config(num_envs=8, rollout_length=length, num_minibatches=minibatches)
+    config = Config(10_000, num_envs=8, rollout_length=length, num_minibatches=minibatches)
     assert examine.timed_steps(config, seconds) == steps
