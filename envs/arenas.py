@@ -179,12 +179,14 @@ class BoxFields(NamedTuple):
     boxes: tuple[int, ...]  # geom ids, W of them
     geom_pos: Array  # [ngeom, 3]
     geom_size: Array  # [ngeom, 3]
+    geom_aabb: Array  # [ngeom, 6]
+    geom_rbound: Array  # [ngeom]
 
 
 def box_fields(model: mujoco.MjModel, boxes: tuple[int, ...]) -> BoxFields:
     """Takes from a model what `course_changes` needs; `boxes` are geom ids."""
-    pos, size = jnp.float32(model.geom_pos), jnp.float32(model.geom_size)
-    return BoxFields(boxes=tuple(boxes), geom_pos=pos, geom_size=size)
+    own = {n: jnp.float32(getattr(model, n)) for n in BoxFields._fields if n != "boxes"}
+    return BoxFields(boxes=tuple(boxes), **own)
 
 
 def course_changes(fields: BoxFields, course: Array, x: Array, reach: float) -> dict[str, Array]:
@@ -197,7 +199,8 @@ def course_changes(fields: BoxFields, course: Array, x: Array, reach: float) -> 
       reach: of the body [m].
 
     Returns:
-      Model fields for `Physics.step`: `geom_pos` and `geom_size`, [ngeom, 3] each.
+      Model fields for `Physics.step`: `geom_pos` and `geom_size`, [ngeom, 3] each, and the bounds
+      that follow from a box's size: `geom_aabb` [ngeom, 6] and `geom_rbound` [ngeom].
     """
     number = len(fields.boxes)
     first = jnp.sum(course[:, 1] < x - reach)
@@ -205,9 +208,12 @@ def course_changes(fields: BoxFields, course: Array, x: Array, reach: float) -> 
     window = jax.lax.dynamic_slice(course, (first, 0), (number, 2))
     ids = jnp.array(fields.boxes)
     half = (window[:, 1] - window[:, 0]) / 2
+    size = fields.geom_size.at[ids, 0].set(half)
     return {
         "geom_pos": fields.geom_pos.at[ids, 0].set(window.mean(axis=1)).at[ids, 2].set(-_THICKNESS),
-        "geom_size": fields.geom_size.at[ids, 0].set(half),
+        "geom_size": size,
+        "geom_aabb": fields.geom_aabb.at[ids, 3].set(half),
+        "geom_rbound": fields.geom_rbound.at[ids].set(jnp.linalg.norm(size[ids], axis=1)),
     }
 
 

@@ -123,7 +123,10 @@ class Run:
         rest = jnp.asarray(model.qpos0, jnp.float32)
         # Unique: a sum of terms that might meet would have no fixed order on a GPU.
         qpos = rest.at[jnp.array(self.joints)].add(limbs, unique_indices=True)
-        task: dict[str, Any] = {"factors": draw_factors(model_key, self.options.randomization)}
+        factors = draw_factors(model_key, self.options.randomization)
+        task: dict[str, Any] = {"factors": factors}
+        if factors:
+            task["fields"] = self.physics.derive(randomized_fields(model, factors))
         if isinstance(self.parts.arena, GapsCorridor):
             task["course"] = draw_course(course_key, self.parts.arena)
             task["crossed"] = jnp.zeros((), jnp.int32)
@@ -152,7 +155,7 @@ class Run:
         return platform_boxes(state.task["course"], self.options.corridor_width)
 
     def _changes(self, task: dict[str, Any], x: Array) -> dict[str, Array]:
-        changes = randomized_fields(self.physics.model, self.options.randomization, task["factors"])
+        changes = dict(task.get("fields", {}))
         if isinstance(self.parts.arena, GapsCorridor):
             reach = self.parts.body.reach
             changes |= course_changes(self.parts.boxes, task["course"], x, reach)
@@ -264,17 +267,11 @@ def draw_factors(key: Array, randomization: Randomization) -> dict[str, Array]:
     return factors
 
 
-def randomized_fields(
-    model: Any, randomization: Randomization, factors: dict[str, Array]
-) -> dict[str, Array]:
-    """Returns the model fields that an episode's factors change.
-
-    Weights that the compiler derives from masses for the constraint solver (`*_invweight0`) stay:
-    they set its regularisation, not the masses.
-    """
+def randomized_fields(model: Any, factors: dict[str, Array]) -> dict[str, Array]:
+    """Returns the model fields that an episode's factors change."""
     fields = {
         "friction": ("geom_friction",),
-        "mass": ("body_mass", "body_inertia", "body_subtreemass"),
+        "mass": ("body_mass", "body_inertia"),
         "gear": ("actuator_gear",),
     }
     changes = {}

@@ -13,6 +13,7 @@ from purerl.core.env import ABSURD, Env, EnvError, State
 from purerl.core.errors import UserError
 from purerl.core.records import Array, PyTree, is_key
 from purerl.machine.state_arrays import flatten
+from purerl.physics import reasons
 
 # What an evaluation measures itself, and adds of the return.
 RESERVED = {"episode_return", "episode_length", "lost"}
@@ -224,12 +225,17 @@ def check_finite(when: str, state: PyTree) -> None:
             )
 
 
+def forget_lost() -> None:
+    """Lets `lost_part` have no reasons from before."""
+    reasons.said.clear()
+
+
 def lost_part(state: PyTree) -> str:
     """Names what is NaN or absurd in states that were reset because they were lost, or ""."""
     try:
         check_finite("reset", state)
     except EnvError as error:
-        return str(error)
+        return f"{error} {reasons.most()}".strip()
     return ""
 
 

@@ -16,6 +16,7 @@ from purerl.checks.watch_physics import check_controls, check_placed
 from purerl.core.env import ABSURD, Env, EnvError, State
 from purerl.core.errors import one_line
 from purerl.machine.state_arrays import flatten
+from purerl.physics import reasons
 
 NUM_ENVS, NUM_STEPS = 16, 20
 STEADY = 1e3  # |mean| beyond so many std: float32 keeps four digits of what varies
@@ -25,6 +26,7 @@ LARGE = 1e4  # std beyond which a unit is probably wrong
 def examine(env: Env, num_steps: int = NUM_STEPS) -> Iterator[Finding]:
     """Yields what is found of an environment, the cheapest first; stops where it cannot go on."""
     before = _members(env)
+    reasons.said.clear()
     try:
         check_env.check_shapes(env)
     except EnvError as broken:
@@ -42,6 +44,8 @@ def examine(env: Env, num_steps: int = NUM_STEPS) -> Iterator[Finding]:
         return
     yield check_repeats(env, trial)
     yield from check_trial(trial)
+    if reason := reasons.most():
+        yield warning("mujoco", reason)
     yield from check_controls(env, trial)
     yield from check_placed(env)
     yield from check_model(env, trial)

@@ -14,6 +14,7 @@ from purerl.core.env import Env, State
 from purerl.core.records import Array
 
 TINY = 1e-5  # of a range: what rounding may do
+FAR = 0.05  # [rad or m] from where a servo holds
 
 
 class Seen(NamedTuple):
@@ -93,45 +94,126 @@ def _describe_controls(model: Any, given: np.ndarray) -> Finding:
 
 
 def check_placed(env: Env, num_envs: int = 4) -> list[Finding]:
-    """Finds quaternions of zeros, and positions that reset changes after `init`.
+    """Finds what the physics is told wrongly or late, in an episode's reset and its first step.
 
-    The first readings, and so the first observation, are of where things were before.
+    The first readings, and so the first observation, are of what `init` was given.
     """
     physics: Any = getattr(env, "physics", None)
     if not hasattr(physics, "model"):
         return []
 
-    from purerl.physics.as_built import ZERO_ROTATION, has_zero_rotation
-
-    def places(key: Array) -> tuple[Any, Any, Any]:
+    def begin(key: Array) -> Begun:
         with watching(physics) as seen:
-            after = env.reset(key).physics
-        names = ("mocap_pos", "mocap_quat", "qpos", "qvel")
-        before = seen.states[-1]
-        arguments, named = seen.calls[-1]
-        given = {**dict(zip(("qpos", "qvel", "changes"), arguments, strict=False)), **named}
-        zero = has_zero_rotation(physics.model, given["qpos"], given.get("changes") or {})
-        old, new = ({n: getattr(x, n) for n in names} for x in (before, after))
-        return zero, old, new
+            state = env.reset(key)
+            resets = len(seen.calls)
+            env.step(state, jnp.zeros(env.action_size))
+        given = _named(("qpos", "qvel", "changes", "ctrl", "act"), seen.calls[resets - 1])
+        later = _named(("state", "ctrl", "changes"), (seen.calls[resets:] or [((), {})])[0])
+        return Begun(given, later, seen.states[resets - 1], state.physics)
 
     try:
-        zero, before, after = jax.jit(jax.vmap(places))(
-            jax.random.split(jax.random.key(0), num_envs)
-        )
+        begun = jax.jit(jax.vmap(begin))(jax.random.split(jax.random.key(0), num_envs))
     except Exception:  # `physics` is something else, or in a trace of the user's own
         return []
-    if np.any(zero):
-        return [error("placing", ZERO_ROTATION)]
-    moved = [name for name in before if (np.asarray(before[name]) != after[name]).any()]
-    if not moved:
-        return [ok("placing", "reset changes no position after init")]
-    cure = "the qpos and qvel that init is given"
-    if moved[0].startswith("mocap"):
-        cure = f'init\'s changes={{"body_{moved[0].removeprefix("mocap_")}": ...}}'
-    return [
-        warning(
+    begun = jax.tree.map(np.asarray, begun)
+    wrong = [*_find_zeros(physics, begun), *_find_moved(begun), *_find_unheld(physics, begun)]
+    placed = wrong or [ok("placing", "reset changes no position after init")]
+    return placed + list(check_changes(physics, begun))
+
+
+class Begun(NamedTuple):
+    """What physics was given in the resets of N environments and their first steps, [N, ...]."""
+
+    given: dict[str, Any]  # arguments of init
+    later: dict[str, Any]  # arguments of the first step, by an action of zeros
+    before: Any  # PhysicsState that init returned
+    after: Any  # that of the state that reset returned
+
+
+def _named(names: tuple[str, ...], call: tuple) -> dict[str, Any]:
+    return {**dict(zip(names, call[0], strict=False)), **call[1]}
+
+
+def _find_zeros(physics: Any, begun: Begun) -> Iterator[Finding]:
+    """Finds quaternions of zeros."""
+    from purerl.physics.as_built import ZERO_ROTATION, has_zero_rotation
+
+    changes = begun.given.get("changes") or {}
+    for i, qpos in enumerate(begun.given["qpos"]):
+        if has_zero_rotation(physics.model, qpos, {n: x[i] for n, x in changes.items()}):
+            yield error("placing", ZERO_ROTATION)
+            return
+
+
+def _find_moved(begun: Begun) -> Iterator[Finding]:
+    """Finds parts of the state that reset changes after init."""
+    names = ("mocap_pos", "mocap_quat", "qpos", "qvel", "act")
+    moved = [n for n in names if (getattr(begun.before, n) != getattr(begun.after, n)).any()]
+    if moved:
+        cure = f"the {moved[0]} that init is given"
+        if moved[0].startswith("mocap"):
+            cure = f'init\'s changes={{"body_{moved[0].removeprefix("mocap_")}": ...}}'
+        yield warning(
             "placing",
             f"reset changes {' and '.join(moved)} after init, so that the first observation is of "
             f"the old place: put it there by {cure}.",
         )
-    ]
+
+
+def _find_unheld(physics: Any, begun: Begun) -> Iterator[Finding]:
+    """Finds position servos that the first step holds near their place, and init does not."""
+    from purerl.physics import lookup
+    from purerl.physics.interface import Physics
+
+    model, step = physics.model, begun.later.get("ctrl")
+    servo = (model.actuator_biasprm[:, 1] != 0) & (model.actuator_dyntype == 0)
+    servo &= (model.actuator_ctrlnum == 1) & (model.actuator_outnum == 1)
+    if step is None or not (physics.reads_forces and servo.any()):
+        return
+    init = begun.given.get("ctrl")
+    init = np.zeros_like(step) if init is None else init
+    lengths = jax.vmap(Physics(model, ("actuator_length",), 1, "c").init)
+    at = np.asarray(lengths(begun.given["qpos"], begun.given["qvel"])[1].actuator_length)
+    control, at = model.actuator_ctrladr[servo], at[:, model.actuator_outadr[servo]]
+    gap = np.abs(init[:, control] - at) - np.abs(step[:, control] - at)
+    env, i = np.unravel_index(np.argmax(gap), gap.shape)
+    if gap[env, i] > FAR:
+        name = lookup.names(model, "actuator")[control[i]] or control[i]
+        yield warning(
+            "placing",
+            f"the first observation is under ctrl {init[env, control[i]]:.3g} of servo {name}, "
+            f"which is at {at[env, i]:.3g}; the first step gives it {step[env, control[i]]:.3g}: "
+            "give init the ctrl=... that holds the pose.",
+        )
+
+
+def check_changes(physics: Any, begun: Begun) -> Iterator[Finding]:
+    """Finds changes of the model that are half, that cannot act, or that a call forgets."""
+    from purerl.physics.changes import idle_rows
+
+    own, found = physics.model, dict[str, Any]()
+    for call, more in (("init", begun.given), ("step", begun.later)):
+        changes = found[call] = more.get("changes") or {}
+        for i in range(len(begun.given["qpos"])):
+            try:
+                physics.check_changes({name: value[i] for name, value in changes.items()})
+            except ValueError as wrong:
+                yield error("changes", f"of {call}: {wrong}")
+                return
+    differ: dict[str, set[str]] = {call: set() for call in found}
+    for call, changes in found.items():
+        for name, value in changes.items():
+            rows = (value != np.float32(getattr(own, name))).any(0)
+            rows = rows.reshape(len(rows), -1).any(1)
+            if name in ("body_pos", "body_quat"):
+                rows &= own.body_mocapid < 0  # there it says where init puts it
+            if (rows & idle_rows(own, physics.engine, name)).any():
+                what = f"changes[{name!r}] differs from the model in rows that nothing heeds"
+                yield warning("changes", f"{what}: {np.flatnonzero(rows)[:6].tolist()}.")
+            differ[call] |= {name} if rows.any() else set()
+    for call, other in (("init", "step"), ("step", "init")):
+        for name in differ[call] - set(found[other]):
+            what = (
+                f"changes[{name!r}] is given to {call} and not to {other}, which takes the model's"
+            )
+            yield warning("changes", f"{what} own: give each call all of them.")

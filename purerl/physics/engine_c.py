@@ -8,9 +8,7 @@ arguments, which is what `jax.pure_callback` and `host_calls` ask for.
 import copy
 import functools
 import math
-import os
 import threading
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -20,12 +18,14 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from purerl.core.records import Array, PyTree
-from purerl.physics import host_calls
+from purerl.physics import host_calls, reasons
 from purerl.physics.lookup import hash_model
 
 _BLOWN_UP = [
     int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{x}")) for x in ("QPOS", "QVEL", "QACC", "CTRL")
 ]
+# Contacts or constraints that MuJoCo left out, as the model's memory was full.
+_FULL = [int(getattr(mujoco.mjtWarning, f"mjWARN_{x}FULL")) for x in ("CONTACT", "CNSTR")]
 
 
 class CEngine:
@@ -46,14 +46,14 @@ class CEngine:
         # All that results depend on, but what is asked of a call.
         self.name = f"purerl-{hash_model(self.model, (*record._fields, stage))}"
         data = mujoco.MjData(model)
-        self.shapes = [np.shape(getattr(data, name)) for name in record._fields]
+        self.shapes = [np.shape(getattr(data, name, 0.0)) for name in record._fields]
         self.rows: dict[tuple, Rows] = {}  # by number, fields and changed fields
         # XLA may run the callbacks of independent programs on several threads at once.
         self.lock = threading.Lock()
 
-    def init(self, state: PyTree, changes: dict[str, Array]) -> tuple:
-        """Returns the readings at `state` under no control."""
-        ctrl = jnp.zeros(self.model.nu, jnp.float32)
+    def init(self, state: PyTree, changes: dict[str, Array], ctrl: Array | None = None) -> tuple:
+        """Returns the readings at `state` under ctrl [nu], by default zeros."""
+        ctrl = jnp.zeros(self.model.nu, jnp.float32) if ctrl is None else ctrl
         return self._call(state, ctrl, changes, 0)[1]
 
     def step(self, state: PyTree, ctrl: Array, changes: dict[str, Array]) -> tuple[PyTree, tuple]:
@@ -65,27 +65,22 @@ class CEngine:
         leaves, structure = jax.tree.flatten(state)
         names = tuple(sorted(changes))
         given = [*leaves, ctrl, *(changes[n] for n in names)]
-        row = jnp.concatenate([jnp.ravel(x).astype(jnp.float32) for x in given])
-        sizes = [leaf.shape for leaf in leaves] + self.shapes
-        ends = np.cumsum([math.prod(size) for size in sizes])
         fields = tuple(state.__dataclass_fields__)
         host = functools.partial(_run_rows, self, fields, names, substeps)
         name = "-".join([self.name, str(substeps), *fields, *names])
-        parts = jnp.split(_call_host(name, host, int(ends[-1]), row), ends[:-1])
-        out = [part.reshape(size) for part, size in zip(parts, sizes, strict=True)]
+        shapes = [leaf.shape for leaf in leaves] + self.shapes
+        out = host_calls.run(name, host, given, shapes)
         state = jax.tree.unflatten(structure, out[: len(leaves)])
         return state, self.record(*map(_as_matrix, self.record._fields, out[len(leaves) :]))
 
     def rows_of(self, number: int, fields: tuple[str, ...], names: tuple[str, ...]) -> "Rows":
         """Returns the simulations of `number` environments, and where their packed rows go."""
         if (number, fields, names) not in self.rows:
-            # MuJoCo by itself starts a thread for each core of the machine, of which this process
-            # may use a few: 64 threads on two cores stepped ants at 0.74 of the rate of two.
-            cores = len(os.sched_getaffinity(0))
-            batch = Batch(_movable(self.model, names), number, nthread=cores)
-            state, out = ([batch.bind(n) for n in x] for x in (fields, self.record._fields))
+            batch = Batch(_movable(self.model, names), number, nthread=host_calls.usable_cores())
+            full, state = np.zeros(number, np.float32), [batch.bind(n) for n in fields]
+            out = [full if n == "overflow" else batch.bind(n) for n in self.record._fields]
             targets = [*state, batch.bind("ctrl"), *(batch.expand(n) for n in names)]
-            self.rows[number, fields, names] = Rows(batch, targets, [*state, *out])
+            self.rows[number, fields, names] = Rows(batch, targets, [*state, *out], full)
         return self.rows[number, fields, names]
 
 
@@ -95,28 +90,17 @@ class Rows(NamedTuple):
     batch: Batch
     targets: list[np.ndarray]  # state, ctrl and changed fields of the model: what a row brings
     sources: list[np.ndarray]  # state and readings: what a row takes away
-
-
-def _call_host(name: str, host: Callable, width: int, row: Array) -> Array:
-    """Calls `host` from a program; returns [width].
-
-    On a GPU machine by JAX's own callback, which it does not keep in its cache.
-    """
-    if jax.default_backend() == "cpu":
-        host_calls.register(name, host)
-        return host_calls.call(name, width, row)
-    shape = jax.ShapeDtypeStruct((width,), jnp.float32)
-    return jax.pure_callback(host, shape, row, vmap_method="broadcast_all")
+    full: np.ndarray  # [N] 1 where contacts were left out: the reading "overflow"
 
 
 def _movable(model: mujoco.MjModel, names: tuple[str, ...]) -> mujoco.MjModel:
-    """Returns a model that heeds changed frames and sizes.
+    """Returns a model that heeds changed frames, sizes and margins.
 
     The compiler marks geoms and sites that coincide with their body (`geom_sameframe`), and MuJoCo
     then never reads their own frame, which would make a change of it do nothing. It also bounds the
     geoms of a body by volumes of its own, and finds no contact outside of those (midphase).
     """
-    if not any(n.endswith(("_pos", "_quat", "_ipos", "_iquat", "_size", "_aabb")) for n in names):
+    if not any(n.endswith(("_pos", "_quat", "_size", "_margin", "_gap")) for n in names):
         return model
     model = copy.copy(model)
     model.geom_sameframe[:] = model.site_sameframe[:] = model.body_sameframe[:] = 0
@@ -140,11 +124,14 @@ def _run_rows(
     rows = np.asarray(rows)
     flat = rows.reshape(-1, rows.shape[-1])
     with engine.lock:
-        batch, targets, sources = engine.rows_of(len(flat), fields, names)
+        batch, targets, sources, full = engine.rows_of(len(flat), fields, names)
         bad = ~np.isfinite(flat).all(axis=1)
         _load(targets, flat, bad, engine.model)
         batch.warning[...] = 0
         bad |= _advance(batch, engine.stage, substeps)
+        full[:] = (batch.warning[:, _FULL, 1] > 0).any(axis=1)
+        if "overflow" not in engine.record._fields:
+            bad |= full > 0  # nobody looks
         read = [source.reshape(len(flat), math.prod(source.shape[1:])) for source in sources]
         out = np.concatenate(read, axis=1, dtype=np.float32)
     out[bad] = np.nan
@@ -161,11 +148,7 @@ def _load(targets: list[np.ndarray], rows: np.ndarray, bad: np.ndarray, model) -
         rows = rows.copy()
         rows[bad] = 0.0
         rows[bad, : model.nq] = model.qpos0
-    end = 0
-    for target in targets:
-        begin, end = end, end + math.prod(target.shape[1:])
-        if end > begin:
-            target[...] = rows[:, begin:end].reshape(target.shape)
+    host_calls.unpack(targets, rows)
 
 
 def _advance(batch: Batch, stage: int, substeps: int) -> np.ndarray:
@@ -177,5 +160,9 @@ def _advance(batch: Batch, stage: int, substeps: int) -> np.ndarray:
             batch.forward()
     except SimulationError:
         pass  # `status` says which; the others ran to completion
+    for i, kind in np.argwhere(batch.warning[..., 1]):
+        reasons.note(mujoco.mju_warningText(int(kind), int(batch.warning[i, kind, 0])))
+    for i in np.flatnonzero(batch.status):
+        reasons.note(batch.error(int(i)))
     # MuJoCo answers a blow-up with a warning and a silent reset of that simulation.
     return (batch.status != 0) | (batch.warning[:, _BLOWN_UP, 1] > 0).any(axis=1)

@@ -62,27 +62,29 @@ class JaxEngine:
         self._exact_init = exact.rewrite(self.plain_init, platform=platform)
         self._exact_step = exact.rewrite(self.plain_step, platform=platform)
 
-    def init(self, state: PyTree, changes: dict[str, Array]) -> tuple:
-        """Returns the readings at `state` under no control."""
+    def init(self, state: PyTree, changes: dict[str, Array], ctrl: Array | None = None) -> tuple:
+        """Returns the readings at `state` under ctrl [nu], by default zeros."""
         with mjx_defaults():
-            return self._exact_init(state, changes)
+            return self._exact_init(state, changes, ctrl)
 
     def step(self, state: PyTree, ctrl: Array, changes: dict[str, Array]) -> tuple[PyTree, tuple]:
         """Advances one control step."""
         with mjx_defaults():
             return self._exact_step(state, ctrl, changes)
 
-    def plain_init(self, state: PyTree, changes: dict[str, Array]) -> tuple:
+    def plain_init(
+        self, state: PyTree, changes: dict[str, Array], ctrl: Array | None = None
+    ) -> tuple:
         """Does what `init` does, with sums in any order."""
-        model = self.model.tree_replace(changes) if changes else self.model
-        data = _forward(model, _load_state(self.data, state), bool(self.late))
+        model, data = self._changed(changes), _load_state(self.data, state)
+        data = _forward(model, data if ctrl is None else data.replace(ctrl=ctrl), bool(self.late))
         return self._read(data)
 
     def plain_step(
         self, state: PyTree, ctrl: Array, changes: dict[str, Array]
     ) -> tuple[PyTree, tuple]:
         """Does what `step` does, with sums in any order."""
-        model = self.model.tree_replace(changes) if changes else self.model
+        model = self._changed(changes)
         rk4 = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
 
         def substep(carry, _):
@@ -100,6 +102,11 @@ class JaxEngine:
         places = [f"_impl.{name}" if name in _IN_IMPL else name for name in self.late]
         data = _load_state(self.data, state).tree_replace(dict(zip(places, late, strict=True)))
         return state, self._read(_kinematics(model, data))
+
+    def _changed(self, changes: dict[str, Array]) -> mjx.Model:
+        """Returns the model with changes; MJX's matrices (`cam_mat0`) are [n, 3, 3]."""
+        shaped = {n: x.reshape(getattr(self.model, n).shape) for n, x in changes.items()}
+        return self.model.tree_replace(shaped) if changes else self.model
 
     def _read(self, data: mjx.Data) -> tuple:
         read = [jnp.reshape(_field_of(data, n), shape) for n, shape in self.shapes.items()]

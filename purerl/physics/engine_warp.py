@@ -29,6 +29,7 @@ from mujoco.mjx.third_party import mujoco_warp as mjw  # noqa: E402
 
 from purerl.core.errors import unknown_name  # noqa: E402
 from purerl.core.records import Array, PyTree  # noqa: E402
+from purerl.physics.changes import CONSTANTS  # noqa: E402
 from purerl.physics.engine_mjx import mjx_defaults, reading_shapes  # noqa: E402
 from purerl.physics.warp_buffers import Batch, Shapes, Stage, make_call, put_model, room  # noqa: E402
 
@@ -78,19 +79,19 @@ class WarpEngine:
         self.batches: dict[Any, Batch] = {}
         self.calls: dict[Any, Callable] = {}
 
-    def init(self, state: PyTree, changes: dict[str, Array]) -> tuple:
-        """Returns the readings at `state` under no control."""
-        return _over_batch(self._init)(state, _known(self.model, changes))
+    def init(self, state: PyTree, changes: dict[str, Array], ctrl: Array | None = None) -> tuple:
+        """Returns the readings at `state` under ctrl [nu], by default zeros."""
+        ctrl = jnp.zeros(self.model.nu, jnp.float32) if ctrl is None else ctrl
+        return _over_batch(self._init)(state, ctrl, _known(self.model, changes))
 
     def step(self, state: PyTree, ctrl: Array, changes: dict[str, Array]) -> tuple[PyTree, tuple]:
         """Advances one control step."""
         return _over_batch(self._step)(state, ctrl, _known(self.model, changes))
 
-    def _init(self, state: PyTree, changes: dict[str, Array]) -> tuple:
+    def _init(self, state: PyTree, ctrl: Array, changes: dict[str, Array]) -> tuple:
         """As `init`, of a batch [B]."""
         size = state.time.shape[0]
-        none = jnp.zeros((size, self.model.nu), jnp.float32)
-        found = self._combine(*self._call("init", state, none, changes))
+        found = self._combine(*self._call("init", state, ctrl, changes))
         return self._read(found, jnp.zeros(size, jnp.float32))
 
     def _step(self, state: PyTree, ctrl: Array, changes: dict[str, Array]) -> tuple[PyTree, tuple]:
@@ -203,10 +204,15 @@ def _nothing(model: mjw.Model, data: mjw.Data) -> None:
 
 
 def _known(model: mujoco.MjModel, changes: dict[str, Array]) -> dict[str, Array]:
-    """Refuses changes of fields of which MJX-Warp has one value for the whole batch, or none."""
+    """Refuses changes of fields of which MJX-Warp has one value for the whole batch, or none.
+
+    Constants that it does not read are left out: what they follow from is there.
+    """
     # Those that may differ between simulations have the type of an array [*, ...].
     types = {f.name: getattr(f.type, "shape", ()) for f in dataclasses.fields(mjw.Model)}
     fields = [name for name, shape in types.items() if shape[:1] == ("*",)]
+    derived = CONSTANTS if set(changes) - set(CONSTANTS) else ()
+    changes = {n: x for n, x in changes.items() if n in fields or n not in derived}
     for name in changes:
         if name not in fields:
             what = "model field that can change on engine 'warp'"

@@ -1,6 +1,8 @@
 """MuJoCo behind one small stateless interface, whatever the engine."""
 
 import collections
+import copy
+import functools
 import importlib.util
 from typing import Any
 
@@ -14,7 +16,15 @@ import purerl
 from purerl.core.errors import unknown_name
 from purerl.core.records import Array, PyTree
 from purerl.physics.as_built import check_unedited, numbers, refuse_zero_rotations
-from purerl.physics.left_out import LEFT_OUT, check_left_out
+from purerl.physics.changes import (
+    CHANGEABLE_FIELDS,
+    CONSTANTS,
+    check_fields,
+    check_shape,
+    check_whole,
+    consequences,
+)
+from purerl.physics.left_out import check_left_out
 
 ENGINES = ("auto", "c", "jax", "warp")
 
@@ -28,28 +38,6 @@ _ACCELERATION = """
 qacc act_dot actuator_force qfrc_actuator qfrc_smooth qacc_smooth qfrc_constraint cacc cfrc_int
 cfrc_ext""".split()  # noqa: SIM905
 READINGS = (*_POSITION, *_VELOCITY, *_ACCELERATION, "sensordata")
-
-# Fields of MjModel that may differ between environments, on every engine: a test compares them with
-# those that MJX traces, so that the `c` engine need not import MJX, which takes seconds.
-CHANGEABLE_FIELDS = tuple(
-    """
-    actuator_acc0 actuator_actrange actuator_biasprm actuator_cranklength actuator_ctrlrange
-    actuator_dynprm actuator_forcerange actuator_gainprm actuator_gear actuator_lengthrange
-    body_gravcomp body_inertia body_invweight0 body_ipos body_iquat body_mass body_pos body_quat
-    body_subtreemass cam_fovy cam_intrinsic cam_mat0 cam_pos cam_pos0 cam_poscom0 cam_quat dof_M0
-    dof_armature dof_damping dof_dampingpoly dof_frictionloss dof_invweight0 dof_solimp dof_solref
-    eq_data eq_solimp eq_solref geom_aabb geom_friction geom_gap geom_margin geom_pos geom_quat
-    geom_rbound geom_rgba geom_size geom_solimp geom_solmix geom_solref jnt_actfrcrange jnt_axis
-    jnt_margin jnt_pos jnt_range jnt_solimp jnt_solref jnt_stiffness jnt_stiffnesspoly
-    light_ambient light_attenuation light_cutoff light_diffuse light_dir light_dir0 light_exponent
-    light_pos light_pos0 light_poscom0 light_specular mat_emission mat_rgba mat_shininess
-    mat_specular pair_friction pair_gap pair_margin pair_solimp pair_solref pair_solreffriction
-    qpos0 qpos_spring site_pos site_quat tendon_actfrcrange tendon_armature tendon_damping
-    tendon_dampingpoly tendon_frictionloss tendon_invweight0 tendon_length0 tendon_lengthspring
-    tendon_margin tendon_range tendon_solimp_fri tendon_solimp_lim tendon_solref_fri
-    tendon_solref_lim tendon_stiffness tendon_stiffnesspoly
-    """.split()  # noqa: SIM905
-)
 
 # Fields that MuJoCo computes only for the sake of a sensor: without one they hold old values.
 _OF_BODY_FORCES = ["accelerometer", "force", "torque", "framelinacc", "frameangacc"]
@@ -86,18 +74,18 @@ class Physics:
     `cfrc_ext`, accelerometers, touch, ...) are of the last substep, which led to that state.
 
     `changes` maps MjModel field names to this simulation's values, of the field's own shape
-    (`{"geom_friction": [ngeom, 3]}`). Fields are set as they are. Constants that the model
-    compiler derives from them (`body_invweight0`, `body_subtreemass`, ... of `mj_setConst`) do not
-    follow: change those too where it matters (for the mass of a lone free body also `dof_M0`, which
-    the C code reads). The centre of mass of a lone free body cannot follow `body_ipos`: put it into
-    a body of its own.
+    (`{"geom_friction": [ngeom, 3]}`). Fields are set as they are. From masses, sizes, armatures,
+    places of bodies, ... MuJoCo derives constants (`body_subtreemass`, `dof_M0`, `geom_rbound`,
+    ...): `derive` adds them, and changes without them are refused. Numbers that the compiler works
+    out of an MJCF's shorthand stay: `dampratio`, a mass from a density. `body_pos` of a mocap body
+    says where `init` puts it.
 
     A simulation that blows up, or is given NaN, returns NaN and touches no other.
 
-    On `warp` contacts and constraints have buffers of a fixed size. If they are too small for a
-    step, some are left out, and the reading "overflow" ([], that engine's alone) is 1 and not 0.
-    If it is not read, such a simulation has blown up. `overflow_reading` and `overflow_metric` make
-    a metric of it.
+    On `warp` contacts and constraints have buffers of a fixed size, on `c` the model's memory
+    (`<size memory="..."/>`). If that is too small for a step, some are left out, and the reading
+    "overflow" ([], of these engines) is 1 and not 0. If it is not read, such a simulation has blown
+    up. `overflow_reading`, for `warp`, and `overflow_metric` make a metric of it.
     """
 
     model: mujoco.MjModel
@@ -130,67 +118,90 @@ class Physics:
                 "mujoco.MjModel.from_xml_path(path)."
             )
         self.engine = choose_engine(engine)
-        _check_model(model, tuple(n for n in readings if n not in overflow_reading(self.engine)))
+        _check_model(model, tuple(n for n in readings if n != "overflow" or self.engine == "jax"))
         check_left_out(model, self.engine)
         if not isinstance(substeps, int | np.integer) or substeps < 1:
             raise ValueError(f"substeps is {substeps!r}: a control step needs 1, 2, 3 or more.")
         self.model, self.substeps, self._built = model, substeps, numbers(model, CHANGEABLE_FIELDS)
+        late = (model.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC).any()
+        self.reads_forces = bool({*_ACCELERATION, *["sensordata"] * bool(late)} & {*readings})
+        self._follows = functools.cache(functools.partial(consequences, copy.copy(model)))
         self.control_timestep = substeps * float(model.opt.timestep)
         record: Any = collections.namedtuple("Readings", list(readings))  # type: ignore[misc]
         self._engine = _build_engine(self.engine, model, record, substeps)
 
     def init(
-        self, qpos: Array, qvel: Array, changes: dict[str, Array] | None = None
+        self,
+        qpos: Array,
+        qvel: Array,
+        changes: dict[str, Array] | None = None,
+        ctrl: Array | None = None,
+        act: Array | None = None,
     ) -> tuple[PhysicsState, PyTree]:
-        """Starts a simulation at qpos [nq], qvel [nv], with no activation and no control."""
-        model, changes = self.model, self._check_changes(changes)
-        _check_shape("qpos", qpos, (model.nq,))
-        _check_shape("qvel", qvel, (model.nv,))
+        """Starts a simulation.
+
+        Args:
+          qpos: positions [nq].
+          qvel: velocities [nv].
+          changes: this simulation's fields of the model.
+          ctrl: controls [nu] under which forces and accelerations are read; None: zeros. A robot
+            of position servos is held by those of its pose.
+          act: activations [na], as of muscles, that the state begins with; None: zeros.
+        """
+        model, changes = self.model, self.check_changes(changes)
+        check_shape("qpos", qpos, (model.nq,))
+        check_shape("qvel", qvel, (model.nv,))
+        act = _float32(np.zeros(model.na) if act is None else act)
+        check_shape("act", act, (model.na,))
+        if ctrl is not None:
+            check_shape("ctrl", ctrl, (model.nu,))
+            ctrl = _float32(ctrl)
         qpos = refuse_zero_rotations(model, qpos, changes)
         mocap = np.argsort(model.body_mocapid, kind="stable")[model.nbody - model.nmocap :]
         state = PhysicsState(
             qpos=_float32(qpos),
             qvel=_float32(qvel),
-            act=jnp.zeros(model.na, jnp.float32),
+            act=act,
             time=jnp.zeros((), jnp.float32),
             qacc_warmstart=jnp.zeros(model.nv, jnp.float32),
             mocap_pos=_float32(changes.get("body_pos", model.body_pos))[mocap],
             mocap_quat=_float32(changes.get("body_quat", model.body_quat))[mocap],
         )
-        return state, self._engine.init(state, changes)
+        return state, self._engine.init(state, changes, ctrl)
 
     def step(
         self, state: PhysicsState, ctrl: Array, changes: dict[str, Array] | None = None
     ) -> tuple[PhysicsState, PyTree]:
         """Advances one control step (`substeps` physics steps) under ctrl [nu]."""
-        _check_shape("ctrl", ctrl, (self.model.nu,))
-        return self._engine.step(state, _float32(ctrl), self._check_changes(changes))
+        check_shape("ctrl", ctrl, (self.model.nu,))
+        return self._engine.step(state, _float32(ctrl), self.check_changes(changes))
 
-    def _check_changes(self, changes: dict[str, Array] | None) -> dict[str, Array]:
+    def derive(self, changes: dict[str, Array]) -> dict[str, Array]:
+        """Returns changes with the constants that MuJoCo derives from them, such as `dof_M0`.
+
+        Call it once, in `reset`, keep what it returns in `State.task`, and give that to `init` and
+        to every `step`. MuJoCo computes it on the host, so that on a GPU a program with it is
+        compiled anew at each start.
+
+        Args:
+          changes: MjModel field names -> this simulation's values, of the field's own shape.
+
+        Raises:
+          ValueError: an unknown field, another shape, or a change that cannot act or be followed.
+        """
+        from purerl.physics.constants import derive  # mujoco.batch is slow to import
+
+        check_fields(self.model, self.engine, changes)
+        behind = {constant for name in changes for constant in self._follows(name)}
+        wanted = tuple(sorted(behind & set(CONSTANTS) - set(changes)))
+        more = derive(self.model, changes, wanted) if wanted else {}
+        return self.check_changes({**changes, **more})
+
+    def check_changes(self, changes: dict[str, Array] | None) -> dict[str, Array]:
+        """Returns changes in float32; ValueError for those that cannot act, or are half."""
         check_unedited(self.model, self._built)
-        for name, value in (changes or {}).items():
-            if name not in CHANGEABLE_FIELDS:
-                what = "model field that can change"
-                raise ValueError(unknown_name(what, name, CHANGEABLE_FIELDS))
-            _check_shape(f"changes[{name!r}]", value, getattr(self.model, name).shape)
-            _check_has_effect(self.model, name, self.engine)
-        return {name: _float32(value) for name, value in (changes or {}).items()}
-
-
-def _check_has_effect(model: mujoco.MjModel, name: str, engine: str) -> None:
-    """Raises for a field that an engine heeds only where the model was compiled with some of it."""
-    value = getattr(model, name)
-    if name == "body_gravcomp" and not value.any():
-        missing = "some body"
-    elif engine == "jax" and name.endswith("_frictionloss") and not value.all():
-        missing = "all of them"
-    elif name in LEFT_OUT[engine]:
-        raise ValueError(f"changes[{name!r}] does nothing on engine {engine!r}: it has no such.")
-    else:
-        return
-    raise ValueError(
-        f"changes[{name!r}] would do nothing: compile the model with {name} above 0 for {missing}."
-    )
+        check_fields(self.model, self.engine, changes or {})
+        return check_whole(self.model, changes or {}, self._follows)
 
 
 def choose_engine(engine: str) -> str:
@@ -274,11 +285,3 @@ def _check_model(model: mujoco.MjModel, readings: tuple[str, ...]) -> None:
 
 def _float32(value: Any) -> Array:
     return jnp.asarray(value, jnp.float32)
-
-
-def _check_shape(name: str, value: Any, shape: tuple[int, ...]) -> None:
-    if jnp.shape(value) != shape:
-        raise ValueError(
-            f"{name} has shape {jnp.shape(value)}; one simulation of this model takes {shape}. "
-            "Batches are the caller's vmap."
-        )

@@ -16,7 +16,7 @@ from purerl.core.records import Array
 
 # Kinds of objects, and how a model counts them.
 _COUNTS = {"body": "nbody", "joint": "njnt", "geom": "ngeom", "site": "nsite", "sensor": "nsensor"}
-_COUNTS |= {"actuator": "nu", "tendon": "ntendon", "camera": "ncam"}
+_COUNTS |= {"actuator": "nactuator", "tendon": "ntendon", "camera": "ncam"}
 
 
 def hash_model(model: mujoco.MjModel, rest: tuple = ()) -> str:
@@ -27,12 +27,16 @@ def hash_model(model: mujoco.MjModel, rest: tuple = ()) -> str:
 
 
 def names(model: mujoco.MjModel, kind: str) -> list[str]:
-    """Returns the names of all objects of a kind ("body", "joint", "sensor", ...), by id."""
-    return [getattr(model, kind)(i).name for i in range(getattr(model, _COUNTS[kind]))]
+    """Returns the names of all objects of a kind ("body", "joint", "sensor", ...), by id.
+
+    Those of actuators are by control, [nu]: one of several controls is there several times.
+    """
+    found = [getattr(model, kind)(i).name for i in range(getattr(model, _COUNTS[kind]))]
+    return np.repeat(found, model.actuator_ctrlnum).tolist() if kind == "actuator" else found
 
 
 def find(model: mujoco.MjModel, kind: str, name: str) -> int:
-    """Returns the id of an object.
+    """Returns the id of an object; of an actuator, its first place in ctrl.
 
     Args:
       model: the model.
@@ -45,7 +49,8 @@ def find(model: mujoco.MjModel, kind: str, name: str) -> int:
     if kind not in _COUNTS:
         raise ValueError(unknown_name("kind of object", kind, _COUNTS))
     try:
-        return getattr(model, kind)(name).id
+        number = getattr(model, kind)(name).id
+        return int(model.actuator_ctrladr[number]) if kind == "actuator" else number
     except KeyError as error:
         raise ValueError(unknown_name(kind, name, names(model, kind))) from error
 
@@ -82,8 +87,8 @@ def scale_action(model: mujoco.MjModel, action: Array) -> Array:
     open_ended = [n for n, ok in zip(names(model, "actuator"), limited, strict=True) if not ok]
     if open_ended:
         raise ValueError(
-            f"Actuators without a ctrlrange: {', '.join(open_ended)}. Give them one, so that an "
-            "action in [-1, 1] has a meaning."
+            f"Actuators without a ctrlrange: {', '.join(dict.fromkeys(open_ended))}. Give them "
+            "one, so that an action in [-1, 1] has a meaning."
         )
     low, high = jnp.asarray(model.actuator_ctrlrange, jnp.float32).T
     return low + 0.5 * (action + 1.0) * (high - low)

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from purerl.checks.check_env import lost_part
+from purerl.checks.check_env import forget_lost, lost_part
 from purerl.checks.user_code import users_errors
 from purerl.core.errors import RunError, StoppedError
 from purerl.core.records import Metrics, PyTree, TrainState, count_as_int
@@ -59,6 +59,7 @@ def train(
       StoppedError: stopped on request, saved.
       RunError: the numbers are no longer finite, or the last checkpoint could not be saved.
     """
+    forget_lost()
     number = len(writers)
     first = update = safe = meta["update"]  # safe: a kill after this update loses nothing
     begin = time.perf_counter()

@@ -247,7 +247,8 @@ class Pushed(Toy):
     def reset(self, key):
         goal = jax.random.normal(key, (2, 3))
         start = (jnp.zeros(1), jnp.zeros(1))
-        physics, readings = self.physics.init(*start, {"body_pos": jnp.pad(goal, ((1, 0), (0, 0)))})
+        place = {"body_pos": jnp.zeros((3, 3)).at[2].set(goal[1])}
+        physics, readings = self.physics.init(*start, place)
         if self.late:
             physics = physics.replace(mocap_pos=goal[:1])
         return toy_state(readings.xpos[2, :2]).replace(physics=physics)
@@ -429,3 +430,51 @@ def test_an_update_is_timed_of_no_more_steps_than_time_allows(minibatches, secon
     length = 20 if minibatches == 8 else 21
     config = Config(10_000, num_envs=8, rollout_length=length, num_minibatches=minibatches)
     assert examine.timed_steps(config, seconds) == steps
+
+
+HELD = """<mujoco><worldbody><body><joint name="j" axis="0 1 0"/><joint name="k" range="-1 1"/>
+<geom size=".1" pos=".3 0 0"/></body></worldbody><actuator><position joint="j" kp="20"/></actuator>
+</mujoco>"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Held(Toy):
+    """A servo that holds its pose; `given` is what init gets more, `late` what step does."""
+
+    physics: Physics
+    given: dict
+    late: dict
+    action_size = 1
+
+    def reset(self, key):
+        qpos = 0.9 + 0.01 * jax.random.normal(key, (2,))
+        physics, readings = self.physics.init(qpos, jnp.zeros(2), **self.given)
+        return toy_state(readings.xpos[1, :2]).replace(physics=physics)
+
+    def step(self, state, action):
+        ctrl = 0.9 + 0.1 * action
+        physics, readings = self.physics.step(state.physics, ctrl, **self.late)
+        return toy_state(readings.xpos[1, :2]).replace(physics=physics)
+
+
+ROUGH = {"changes": {"geom_friction": np.full((1, 3), 0.7)}}
+IDLE = {"changes": {"jnt_range": np.array([[-0.1, 0.1], [-1.0, 1.0]])}}
+
+
+@pytest.mark.parametrize(
+    ("given", "late", "said"),
+    [
+        ({"ctrl": np.full(1, 0.9)}, {}, {}),
+        ({}, {}, {"placing": "ctrl 0 of servo 0, which is at 0.9"}),
+        ({"ctrl": np.full(1, 0.9)} | ROUGH, {}, {"changes": "to init and not to step"}),
+        ({"ctrl": np.full(1, 0.9)}, ROUGH, {"changes": "to step and not to init"}),
+        ({"ctrl": np.full(1, 0.9)} | ROUGH, ROUGH, {}),
+        ({"ctrl": np.full(1, 0.9)} | IDLE, IDLE, {"changes": "'jnt_range'] differs .* nothing"}),
+    ],
+)
+def test_what_init_and_step_are_given(given, late, said):
+    physics = Physics(mujoco.MjModel.from_xml_string(HELD), ("xpos", "qacc"), 1, "c")
+    found = bad(check_placed(Held(physics, given, late)))
+    assert set(found) == set(said)
+    for about, text in said.items():
+        assert re.search(text, found[about])

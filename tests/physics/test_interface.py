@@ -183,7 +183,7 @@ from purerl.physics.interface import Physics
 model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body><freejoint/><geom size='.1'/>"
     "</body></worldbody></mujoco>")
 physics = Physics(model, ("xpos",), engine="{engine}")
-physics._check_changes({{"body_mass": np.ones(2)}})
+physics.check_changes({{"geom_friction": np.ones((1, 3))}})
 assert ("mujoco.mjx" in sys.modules) == ("{engine}" == "jax")
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)

@@ -1,0 +1,168 @@
+"""Fields of a model that differ between simulations: which may, what follows, what cannot act."""
+
+import contextlib
+import copy
+import re
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from purerl.core.errors import unknown_name
+from purerl.core.records import Array
+from purerl.physics.left_out import LEFT_OUT
+
+# Fields of MjModel that may differ between environments, on every engine: a test compares them with
+# those that MJX traces, so that the `c` engine need not import MJX, which takes seconds.
+CHANGEABLE_FIELDS = tuple(
+    """
+    actuator_acc0 actuator_actrange actuator_biasprm actuator_cranklength actuator_ctrlrange
+    actuator_dynprm actuator_forcerange actuator_gainprm actuator_gear actuator_lengthrange
+    body_gravcomp body_inertia body_invweight0 body_ipos body_iquat body_mass body_pos body_quat
+    body_subtreemass cam_fovy cam_intrinsic cam_mat0 cam_pos cam_pos0 cam_poscom0 cam_quat dof_M0
+    dof_armature dof_damping dof_dampingpoly dof_frictionloss dof_invweight0 dof_solimp dof_solref
+    eq_data eq_solimp eq_solref geom_aabb geom_friction geom_gap geom_margin geom_pos geom_quat
+    geom_rbound geom_rgba geom_size geom_solimp geom_solmix geom_solref jnt_actfrcrange jnt_axis
+    jnt_margin jnt_pos jnt_range jnt_solimp jnt_solref jnt_stiffness jnt_stiffnesspoly
+    light_ambient light_attenuation light_cutoff light_diffuse light_dir light_dir0 light_exponent
+    light_pos light_pos0 light_poscom0 light_specular mat_emission mat_rgba mat_shininess
+    mat_specular pair_friction pair_gap pair_margin pair_solimp pair_solref pair_solreffriction
+    qpos0 qpos_spring site_pos site_quat tendon_actfrcrange tendon_armature tendon_damping
+    tendon_dampingpoly tendon_frictionloss tendon_invweight0 tendon_length0 tendon_lengthspring
+    tendon_margin tendon_range tendon_solimp_fri tendon_solimp_lim tendon_solref_fri
+    tendon_solref_lim tendon_stiffness tendon_stiffnesspoly
+    """.split()  # noqa: SIM905
+)
+
+# Those of them that mj_setConst derives from others, and those that the compiler alone does.
+CONSTANTS = """
+body_subtreemass body_invweight0 dof_invweight0 dof_M0 tendon_length0 tendon_invweight0
+actuator_acc0 eq_data geom_rbound geom_aabb cam_pos0 cam_poscom0 cam_mat0 light_pos0 light_poscom0
+light_dir0
+""".split()  # noqa: SIM905
+_COMPILED = ("tendon_lengthspring", "actuator_lengthrange")
+# Ends of names, and of the field without which those do nothing: jnt_range, jnt_limited.
+_SWITCHES = {r"(range|margin|solref|solimp)(_lim)?$": "limited", r"(dyn|bias)prm$": r"\1type"}
+_TRACKING = [int(getattr(mujoco.mjtCamLight, f"mjCAMLIGHT_{x}")) for x in ("TRACK", "TRACKCOM")]
+Follows = Callable[[str], dict[str, np.ndarray]]  # `consequences` of a field, kept
+
+
+def check_fields(model: mujoco.MjModel, engine: str, changes: dict[str, Any]) -> None:
+    """Raises ValueError for changes that are unknown, of another shape, or without effect."""
+    for name, value in changes.items():
+        if name not in CHANGEABLE_FIELDS:
+            raise ValueError(unknown_name("model field that can change", name, CHANGEABLE_FIELDS))
+        check_shape(f"changes[{name!r}]", value, getattr(model, name).shape)
+        idle = idle_rows(model, engine, name)
+        if idle.size and idle.all():
+            raise ValueError(
+                f"changes[{name!r}] would do nothing on engine {engine!r}: it is heeded only where "
+                "the model was compiled with such a limit, with an actuator of that kind, or with "
+                f"{name} above 0 (frictionloss on 'jax': everywhere)."
+            )
+
+
+def check_whole(
+    model: mujoco.MjModel, changes: dict[str, Any], follows: Follows
+) -> dict[str, Array]:
+    """Returns changes in float32; ValueError for those without what follows from them.
+
+    Places (`..._pos`, `..._quat`) may change in rows from which nothing follows, such as a goal's.
+    Where only a program will know in which they have changed, the others are NaN if they have.
+    """
+    found = {}
+    for name, value in changes.items():
+        own, traced = np.float32(getattr(model, name)), isinstance(value, jax.core.Tracer)
+        value = value if traced else np.asarray(value, np.float32)
+        place = traced and name.endswith(("_pos", "_quat"))
+        for rows, reason in _refusals(model, name, changes, follows):
+            differs = (value != own) & rows.reshape(-1, *[1] * (own.ndim - 1))
+            if not place and rows.any() and (traced or differs.any()):
+                raise ValueError(f"changes[{name!r}] {reason}")
+            value = jnp.where(differs, jnp.nan, value) if place and rows.any() else value
+        found[name] = jnp.asarray(value, jnp.float32)
+    return found
+
+
+def consequences(model: mujoco.MjModel, name: str) -> dict[str, np.ndarray]:
+    """Returns the constants that follow from a field, and from which of its rows, [n] bool each.
+
+    MuJoCo is asked: it sets the constants of a model in which one row is another. A mocap body is
+    where the state says, and a muscle alone heeds `actuator_acc0`.
+    """
+    model, rows = copy.copy(model), np.arange(len(getattr(model, name)))
+    if name in ("body_pos", "body_quat"):
+        rows = np.flatnonzero(model.body_mocapid < 0)
+    found: dict[str, np.ndarray] = {}
+    data, field = mujoco.MjData(model), getattr(model, name)
+    own, base = field.copy(), _set_constants(model, data)
+    for row in rows if name not in CONSTANTS else ():
+        field[row] = 1.1 * own[row] + 0.01
+        field[row] /= np.linalg.norm(field[row]) if name.endswith("quat") else 1.0
+        with contextlib.suppress(mujoco.FatalError):  # of simple bodies: `_refusals` tells
+            for constant, value in _set_constants(model, data).items():
+                if not np.allclose(value, base[constant], 1e-7, 1e-12):
+                    found.setdefault(constant, np.zeros(len(own), bool))[row] = True
+        field[row] = own[row]
+    muscles = (model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_MUSCLE)).any()
+    muscles |= (model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_MUSCLE)).any()
+    if "tendon_length0" in found and model.tendon_stiffness.any():
+        found["tendon_lengthspring"] = found["tendon_length0"]
+    if "actuator_acc0" in found and muscles:
+        found["actuator_lengthrange"] = found["actuator_acc0"]
+    return {n: x for n, x in found.items() if n != "actuator_acc0" or muscles}
+
+
+def idle_rows(model: mujoco.MjModel, engine: str, name: str) -> np.ndarray:
+    """Tells which rows of a field, [n] bool, an engine never heeds."""
+    value = getattr(model, name)
+    all_idle = name in LEFT_OUT[engine] or (name == "body_gravcomp" and not value.any())
+    all_idle |= engine == "jax" and name.endswith("_frictionloss") and not value.all()
+    idle = np.full(len(value), all_idle)
+    for end, other in _SWITCHES.items():
+        switch = re.sub(end, other, name)
+        if switch != name and hasattr(model, switch):
+            idle |= getattr(model, switch) == 0
+    return idle
+
+
+def _set_constants(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, np.ndarray]:
+    """Sets a model's constants; returns those that are heeded: a camera's only where it tracks."""
+    mujoco.mj_setConst(model, data)
+    modes = {"cam": model.cam_mode, "light": model.light_mode}
+    tracks = {kind: np.isin(mode, _TRACKING) for kind, mode in modes.items()}
+    return {n: getattr(model, n)[tracks.get(n.split("_")[0], ...)].copy() for n in CONSTANTS}
+
+
+def _refusals(
+    model: mujoco.MjModel, name: str, changes: dict[str, Any], follows: Follows
+) -> Iterator[tuple[np.ndarray, str]]:
+    """Yields rows [n] of a changed field that must be the model's own, and why."""
+    if name in ("jnt_pos", "jnt_axis", "body_ipos", "body_iquat"):
+        bodies = model.jnt_bodyid if name.startswith("jnt") else np.arange(model.nbody)
+        yield (
+            (model.body_simple[bodies] > 0) & (model.body_dofnum[bodies] > 0),
+            "would not change the inertia of a body that was compiled as a simple one (it is free, "
+            'or slides): write simple="false" into its <body>.',
+        )
+    behind = {n: rows for n, rows in follows(name).items() if n not in changes}
+    if behind:
+        hand = " and ".join(n for n in behind if n in _COMPILED)
+        yield (
+            np.any(list(behind.values()), axis=0),
+            f"alone is half a change: {', '.join(behind)} would follow from it. Give what "
+            "physics.derive(changes) returns, computed once in reset"
+            + (f", and {hand} by hand: MuJoCo's compiler alone has it." if hand else "."),
+        )
+
+
+def check_shape(name: str, value: Any, shape: tuple[int, ...]) -> None:
+    """Raises ValueError for another shape than that of one simulation."""
+    if jnp.shape(value) != shape:
+        raise ValueError(
+            f"{name} has shape {jnp.shape(value)}; one simulation of this model takes {shape}. "
+            "Batches are the caller's vmap."
+        )
