@@ -316,8 +316,9 @@ def test_the_table_tells_what_slurm_has_and_the_exit_code_what_failed(place, mon
 def test_here_a_task_is_in_the_queue_as_long_as_its_process_lives(tmp_path):
     ended = subprocess.Popen("true")
     ended.wait()
-    assert slurm._is_queued(tmp_path, "local", str(os.getpid()))
-    assert not slurm._is_queued(tmp_path, "local", str(ended.pid))
+    job = scheduler.Job("a", (), (), tmp_path / "log")
+    for pid, lives in ((os.getpid(), True), (ended.pid, False)):
+        assert slurm._is_under_way(job, tmp_path, "local", {"a": str(pid)}) is lives
 
 
 @pytest.mark.slow
