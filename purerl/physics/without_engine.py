@@ -23,9 +23,9 @@ class NoEngine:
         # As on all engines, matrices are [n, 3, 3].
         self.shapes = [(s[0], 3, 3) if name.endswith("mat") else s for name, s in shapes.items()]
 
-    def init(self, state: PyTree, changes: dict[str, Array]) -> tuple:
+    def init(self, state: PyTree, changes: dict[str, Array], ctrl: Array | None = None) -> tuple:
         """Returns readings."""
-        return self.step(state, jnp.zeros(()), changes)[1]
+        return self.step(state, jnp.zeros(()) if ctrl is None else ctrl, changes)[1]
 
     def step(self, state: PyTree, ctrl: Array, changes: dict[str, Array]) -> tuple[PyTree, tuple]:
         """Returns a state and readings."""
