@@ -65,7 +65,7 @@ def command(words: Sequence[str]) -> None:
     output.show(*titles(problems), *said)
     whole = {name: x.figures | x.judged for name, x in played.items()}
     if options.csv is not None:
-        write_answer(options.csv, figures.rows(whole).encode())
+        write_answer(options.csv, figures.rows(whole))
     if options.json is not None:
         about: dict[str, Any] = {"problem": first.name, "trained": first.trained}
         about["environments"] = {one.title: one.settings for one in problems}

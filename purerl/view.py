@@ -10,6 +10,7 @@ A run's folder is only read, and may be training meanwhile.
 
 import functools
 import importlib.util
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -32,8 +33,8 @@ class ViewOptions(PlanOptions):
     """Who chooses the actions; by default a run's policy, and the planner of an experiment. Of a
     run, plans correct its policy's actions, and its value counts at the horizon."""
     host: str = "127.0.0.1"
-    """Where to listen. By default only this machine can open the page; over SSH, forward the port:
-    ssh -L 8080:127.0.0.1:8080 MACHINE."""
+    """Where to listen: by default this machine alone; over SSH, forward the port:
+    ssh -L 8080:127.0.0.1:8080 MACHINE. Only who has the whole address can open the page."""
     port: int = 8080
     """The port to listen on."""
 
@@ -46,7 +47,9 @@ def has_viser() -> bool:
 def command(words: Sequence[str]) -> None:
     """Opens the page and plays until Ctrl-C."""
     found = find(words, PROG)
-    chosen, options = settings_of(found, words[1:], f"{PROG} {found.name}", ViewOptions)
+    chosen, options = settings_of(
+        found, words[1:], f"{PROG} {shlex.quote(found.name)}", ViewOptions
+    )
     if not has_viser():  # its help needs no window
         raise UserError(f"The window needs the package viser: {purerl.how_to_install('view')}")
     from purerl.tune.view import opening
@@ -59,7 +62,7 @@ def command(words: Sequence[str]) -> None:
     try:
         if options.port not in (0, page.port):  # viser takes the next one
             raise UserError(f"Port {options.port} was taken meanwhile: give another, as --port.")
-        show(f"{title}: open http://{options.host}:{page.port} in a browser; Ctrl-C ends.")
+        show(f"{title}: open {page.address} in a browser; Ctrl-C ends.")
         play(page, session, source, lambda line: show(line))
     except KeyboardInterrupt:
         show("Closed.")

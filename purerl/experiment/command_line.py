@@ -5,6 +5,7 @@ import dataclasses
 import enum
 import io
 import re
+import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -87,7 +88,8 @@ def read_experiment(
             "[--option value ...]"
         )
     source = find_source(words[0])
-    return source, *from_command_line(source, words[1:], f"{prog} {words[0]}", base=base, **more)
+    prog = f"{prog} {shlex.quote(words[0])}"
+    return source, *from_command_line(source, words[1:], prog, base=base, **more)
 
 
 def from_command_line(
@@ -154,7 +156,7 @@ def from_settings(
             dotted = {f"{name}.{inner}": one for inner, one in value.items()}
             raise UserError(f"Settings of {name} have dotted names: give {dotted}.")
     words = [word for pair in {**settings, **options}.items() for word in _words(*pair)]
-    known = source.name if source.name in available() else source.path
+    known = shlex.quote(source.name if source.name in available() else str(source.path))
     return from_command_line(source, words, f"python -m purerl.run {known}", WORDS, **more)
 
 

@@ -1,7 +1,11 @@
 """A folder of arrays on the disk, as Orbax writes and reads it: the one module that knows Orbax."""
 
+import contextlib
 import logging
+import os
+import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +15,8 @@ import numpy as np
 
 def write(folder: Path, arrays: dict[str, np.ndarray]) -> None:
     """Writes arrays into a new folder; raises what Orbax raises."""
-    with _checkpointer() as checkpointer:
-        checkpointer.save(folder.absolute(), _orbax().args.PyTreeSave(arrays))
+    with _checkpointer() as checkpointer, _plain(folder) as plain:
+        checkpointer.save(plain, _orbax().args.PyTreeSave(arrays))
 
 
 def read(folder: Path, like: dict[str, Any]) -> dict[str, np.ndarray]:
@@ -21,12 +25,27 @@ def read(folder: Path, like: dict[str, Any]) -> dict[str, np.ndarray]:
     wanted = {key: jax.ShapeDtypeStruct(x.shape, x.dtype) for key, x in like.items()}
     kinds = {key: ocp.RestoreArgs(np.ndarray, dtype=x.dtype) for key, x in like.items()}
     how = ocp.args.PyTreeRestore(wanted, restore_args=kinds, partial_restore=True)
-    with _checkpointer() as checkpointer:
-        found = checkpointer.restore(folder.absolute(), how)
+    with _checkpointer() as checkpointer, _plain(folder) as plain:
+        found = checkpointer.restore(plain, how)
     for key, x in found.items():
         if not isinstance(x, np.ndarray):  # Orbax hands back what it was given
             raise ValueError(f"leaf {key} is not there")
     return found
+
+
+@contextlib.contextmanager
+def _plain(folder: Path) -> Iterator[Path]:
+    r"""Yields a path to a folder in which Orbax and TensorStore find no syntax of theirs.
+
+    To them `[1]` and `*` are patterns, `\` is `/`, and `gs:` begins an address.
+    """
+    place = folder.absolute()
+    with contextlib.ExitStack() as stack:
+        if not re.fullmatch(r"[\w/. +,=@~-]*", str(place)):
+            above = os.open(place.parent, os.O_PATH | os.O_DIRECTORY)
+            stack.callback(os.close, above)
+            place = Path(f"/proc/self/fd/{above}", place.name)
+        yield place
 
 
 def _checkpointer() -> Any:

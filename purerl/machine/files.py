@@ -8,23 +8,27 @@ A folder may come from a stranger. What stands where a file should be shall neit
 """
 
 import contextlib
+import csv
 import errno
 import hashlib
 import io
 import json
 import os
+import re
 import reprlib
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import NoneType
 from typing import Any, get_args
 
 from purerl.core.errors import UserError, one_line
+from purerl.machine.output import printable
 
 LARGEST = 16 << 20  # [bytes] of a JSON file
 LONGEST_NAME = 200  # [bytes]; most file systems take 255, and a seed's number may follow
 DEEPEST = 50  # objects and lists in each other; Python's own recursion ends at some hundreds
+FORMULA = re.compile(r"[=+@-](?![\d.]+(e[+-]?\d+)?$|inf$)")
 KINDS = {
     dict: "an object {name: value}", list: "a list", str: "a string", int: "a whole number",
     float: "a number", bool: "true or false", NoneType: "null",
@@ -137,10 +141,35 @@ def write_file(path: Path, content: bytes) -> None:
     """Writes a file whole or not at all; UserError if the disk refuses."""
     draft = draft_of(path)
     with writing(path):
-        draft.write_bytes(content)
+        draft.unlink(missing_ok=True)  # it may be a link
+        with draft.open("xb") as file:
+            file.write(content)
         sync(draft)
         draft.replace(path)
         sync(path.parent)
+
+
+def open_log(path: Path, mode: str = "ab") -> Any:
+    """Opens a file to which lines are added; OSError for a link, or a pipe that nobody reads."""
+    flags = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY
+    return open(path, mode, 0, opener=lambda name, how: os.open(name, how | flags, 0o666))
+
+
+def as_csv(columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> bytes:
+    """Returns a table as CSV; what is None or missing is an empty cell.
+
+    No text commands a terminal, and none is a formula where a spreadsheet opens it.
+    """
+
+    def cell(value: Any) -> Any:
+        said = printable(value) if isinstance(value, str) else value
+        return f"'{said}" if FORMULA.match(str(said)) else said
+
+    file = io.StringIO(newline="")
+    writer = csv.DictWriter(file, columns, extrasaction="ignore", lineterminator="\n")
+    for row in (dict(zip(columns, columns, strict=True)), *rows):
+        writer.writerow({name: cell(value) for name, value in row.items()})
+    return file.getvalue().encode()
 
 
 def write_answer(path: Path, content: bytes) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from purerl.core.errors import RunError, UserError
 from purerl.machine.files import make_folder
 
-LOCK = ".lock"
+LOCK, LOCKED = ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
 PATIENCE, PAUSE = 1.0, 0.05  # seconds
 # NFS locks no folder, and no read-only file; some file systems lock nothing at all.
 NO_LOCKS = {errno.EBADF, errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL}
@@ -44,7 +44,7 @@ class FolderLock:
         self.folder, self.held = folder, held
         self.handles = [os.open(folder, os.O_RDONLY | os.O_DIRECTORY)]
         try:
-            self.handles.append(os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o644))
+            self.handles.append(os.open(folder / LOCK, LOCKED, 0o644))
             self.locks = any(self._try(handle, patience) for handle in self.handles)
             os.ftruncate(self.handles[1], 0)
             os.pwrite(self.handles[1], f"{os.getpid()}\n".encode(), 0)

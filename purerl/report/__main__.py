@@ -4,6 +4,7 @@ One HTML file: curves, every metric, evaluations, settings, videos. It needs no 
 browser opens it; hover for values. Nothing of the runs is executed.
 """
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -36,7 +37,8 @@ def command(options: ReportOptions) -> None:
     from purerl.report.run_reader import read_runs
 
     if options.out.is_dir():
-        raise UserError(f"{options.out} is a folder: give a file, as --out {options.out}/a.html.")
+        instead = shlex.quote(str(options.out / "a.html"))
+        raise UserError(f"{options.out} is a folder: give a file, as --out {instead}.")
     runs = read_runs(options.runs, "report")
     page = make_page(runs, options.group_by).encode()
     write_answer(options.out, page)

@@ -1,14 +1,13 @@
 """Runs compared: `compare` gathers everything, `describe` tells it, `write` makes files of it."""
 
 import contextlib
-import csv
 import io
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import UserError
-from purerl.machine.files import write_json, writing
+from purerl.machine.files import as_csv, write_file, write_json, writing
 from purerl.machine.output import printable
 from purerl.report import bit_diff, run_reader, seed_statistics
 from purerl.report.bootstrap import LEAST_IQM, LEAST_RUNS, center_name
@@ -187,8 +186,8 @@ def write(folder: Path, result: dict[str, Any], curves: Sequence[Curve]) -> None
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "compare.json", result)
-        write_csv(folder / "groups.csv", GROUPS_CSV, groups)
-        write_csv(folder / "curves.csv", CURVES_CSV, _curve_rows(curves))
+        write_file(folder / "groups.csv", as_csv(GROUPS_CSV, groups))
+        write_file(folder / "curves.csv", as_csv(CURVES_CSV, _curve_rows(curves)))
         if curves:
             draw_curves(folder / "curves.png", curves, result["metric"])
 
@@ -198,20 +197,6 @@ def _curve_rows(curves: Iterable[Curve]) -> Iterator[dict[str, Any]]:
         for i, steps in enumerate(curve.steps):
             band = {k: None if v is None else v[i] for k, v in curve.band._asdict().items()}
             yield {"group": curve.label, "n": len(curve.runs), "steps": steps} | band
-
-
-def write_csv(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> None:
-    """Writes rows; what is None or missing is an empty cell."""
-    path.write_bytes(csv_text(columns, rows).encode(errors="backslashreplace"))
-
-
-def csv_text(columns: Sequence[str], rows: Iterable[dict[str, Any]], end: str = "\r\n") -> str:
-    """Returns rows as CSV, each with the `end` of its line."""
-    written = io.StringIO()
-    writer = csv.DictWriter(written, columns, extrasaction="ignore", lineterminator=end)
-    writer.writeheader()
-    writer.writerows(rows)
-    return written.getvalue()
 
 
 def plotter() -> Any:
@@ -238,8 +223,9 @@ def picture(path: Path, *shape: int, **options: Any) -> Iterator[tuple[Any, Any]
     figure, axes = pyplot.subplots(*shape, layout="constrained", **options)
     try:
         yield figure, axes
-        with writing(path):
-            figure.savefig(path, dpi=120)
+        content = io.BytesIO()
+        figure.savefig(content, format=path.suffix[1:], dpi=120)
+        write_file(path, content.getvalue())
     finally:  # a notebook would draw what is left open
         pyplot.close(figure)
 

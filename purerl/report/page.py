@@ -7,6 +7,7 @@ browser execute `page.js` and nothing else.
 import base64
 import hashlib
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from purerl.report.run_reader import RunRecord
 from purerl.report.seed_statistics import Group, make_groups
 
 HERE = Path(__file__).parent
+FOLDERS = re.compile(r"""(data:[^"]*)|(?<![\w./:<])/(?:[^/<>"\s]+/)+""")  # not in pictures
 
 
 def make_page(runs: Sequence[RunRecord], group_by: Sequence[str] = ()) -> str:
@@ -31,6 +33,8 @@ def make_page(runs: Sequence[RunRecord], group_by: Sequence[str] = ()) -> str:
     Raises:
       UserError: there is no such setting.
     """
+    folders = [run.path for run in runs]
+    runs = [run._replace(path=Path(*run.path.parts[-2:])) for run in runs]
     groups = make_groups(runs, group_by)
     result, _ = comparison.compare_records(runs, page_series.RETURN, group_by)
     sections = page_series.panels(groups)
@@ -45,7 +49,7 @@ def make_page(runs: Sequence[RunRecord], group_by: Sequence[str] = ()) -> str:
         *_unseen(runs),
         *_section("Last evaluation of each run", page_tables.evaluations(runs)),
         *_section("Settings", *page_tables.settings(runs, result)),
-        *_section("Videos", *_media(runs)),
+        *_section("Videos", *_media(folders)),
         element("div", id="tip", class_="off"),
     ]
     return _document(title, body, _data(sections, groups))
@@ -70,8 +74,13 @@ def _document(title: str, body: Sequence[Html], data: Html) -> str:
         element("title", title),
         element("style", style),
     )
-    inside = element("body", *body, data, element("script", script))
+    inside = element("body", *map(_sendable, (*body, data)), element("script", script))
     return f"<!DOCTYPE html>\n{element('html', head, inside, lang='en')}\n"
+
+
+def _sendable(part: Html) -> Html:
+    """Returns a part without the folders of absolute paths, which are nobody else's business."""
+    return Html(FOLDERS.sub(lambda found: found[1] or "", part))
 
 
 def _digest(content: str) -> str:
@@ -173,10 +182,10 @@ def _series_data(
 # --- videos ---
 
 
-def _media(runs: Sequence[RunRecord]) -> list[Html]:
+def _media(folders: Sequence[Path]) -> list[Html]:
     room, parts = LARGEST_PAGE, list[Html]()
-    for run in runs:
-        media = read_media(run.path, room)
+    for folder in folders:
+        media = read_media(folder, room)
         room = media.room
-        parts += media_elements(run.path.name, media)
+        parts += media_elements(folder.name, media)
     return [element("div", join(parts), class_="pictures")] if parts else []

@@ -40,7 +40,7 @@ def read_media(folder: Path, room: int) -> Media:
             try:
                 content = _read(folder, path, min(room, LARGEST))
             except UserError as error:
-                found.left_out.append(str(error))
+                found.left_out.append(str(error).replace(f"{folder}/", ""))
                 continue
             room -= len(content)
             found.files.setdefault(path.stem, {})[path.suffix] = content

@@ -26,7 +26,7 @@ def _run_row(run: RunRecord) -> list[Any]:
     device = run.manifest.get("device")
     place = device.get("kind", "") if isinstance(device, dict) else ""
     return [
-        element("span", run.path.name, title=run.path),
+        run.path.name,
         run.seed,
         element("span", run.status, class_=kind),
         f"{last['update']:,}{of}",
@@ -119,7 +119,8 @@ def settings(runs: Sequence[RunRecord], result: dict[str, Any]) -> list[Html]:
         parts.append(element("p", "The runs differ in no setting but the seed.", class_="note"))
     for line in result["conditions_that_differ"]:
         parts.append(element("p", f"Other conditions: {_cut(line)}", class_="note"))
-    conditions = flatten({k: v for k, v in runs[0].manifest.items() if k != "source"})
+    hidden = ("source", "experiment_file")
+    conditions = flatten({k: v for k, v in runs[0].manifest.items() if k not in hidden})
     return [
         *parts,
         _details(f"All settings of {runs[0].path.name}", runs[0].settings),

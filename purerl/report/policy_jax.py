@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 from jax import export
+from jax._src import config
 
 from purerl.machine.files import write_answer
 from purerl.report.flat_program import batched
@@ -20,7 +21,8 @@ def write_jax(run: Run, file: Path) -> Callable[[Any], np.ndarray]:
     """Writes a policy by `jax.export`; returns that of the file, of observations [N, ...]."""
     policy = policy_function(run)
     arguments = batched((policy.observation, policy.memory), *export.symbolic_shape("batch"))
-    exported = export.export(jax.jit(policy.act), platforms=PLATFORMS)(*arguments)
+    with config.hlo_source_file_canonicalization_regex(".*/"):  # or it holds our folders' names
+        exported = export.export(jax.jit(policy.act), platforms=PLATFORMS)(*arguments)
     content = exported.serialize()
     write_answer(file, bytes(content))
     return remembering(policy, export.deserialize(bytearray(content)).call)

@@ -91,6 +91,8 @@ def load_checkpoint(path: Path, abstract: PyTree, owners: Sequence[Owner] = ()) 
         if leaves.keys() == meta["leaves"].keys() and digest_leaves(leaves) != meta["digest"]:
             raise ValueError("the digest of all leaves is another")
     except Exception as error:  # Orbax raises many kinds. Its files are what it wrote, so:
+        if not path.exists():
+            raise checkpoint_folder.DamagedError("it was deleted meanwhile") from error
         raise UserError(
             f"The checkpoint {path} is whole on the disk, but cannot be read: "
             f"{one_line(error):.300}. Nothing was changed: mend the installation, the memory or "
@@ -127,6 +129,8 @@ def newest(
             try:
                 found.append(load_checkpoint(path, abstract, of))
             except checkpoint_folder.DamagedError as error:
+                if not path.exists():  # by the run, which goes on and has newer ones
+                    return newest(folders, abstract, say, rename, owners)
                 kept = checkpoint_folder.set_aside(path) if rename else path
                 say(f"Checkpoint of update {update} is damaged: {error}. It is kept as {kept}; "
                     "the one before it is taken, if there is one.")  # fmt: skip

@@ -141,6 +141,12 @@ def note(folder: Folder, **facts: Any) -> Folder:
     return folder._replace(manifest=manifest)
 
 
+def check_no_links(folder: Folder) -> None:
+    """Raises UserError if what is written would not stay in the folder."""
+    for name in sorted(folder.links):
+        raise UserError(f"{folder.path / name} is no file, but a link or worse: remove it.")
+
+
 def check_is_run(path: Path) -> None:
     """Raises UserError unless a folder holds a run; the message lists the runs inside of it."""
     found = runs_in(path) or runs_in("runs" / path)

@@ -5,6 +5,7 @@ A run writes it down at the start, and `--resume` compares it.
 
 import os
 import platform
+import re
 import subprocess
 from collections.abc import Callable, Iterable, Sequence
 from importlib import metadata
@@ -23,7 +24,11 @@ INFORMATIVE |= {"devices"}  # how many share the shards
 INFORMATIVE |= {"fingerprint", "had_checkpoint"}  # identity.py, folder.py
 # What these follow from is compared itself.
 INFORMATIVE |= {"experiment_file", "bit_exact", "inexact_because"}
-FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE", "JAX_PLATFORMS", "JAX_ENABLE_X64")
+FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE")
+# Words in the names of JAX's options that move no bit; of all others the value is written down.
+HARMLESS = re.compile(
+    "cache|check_|checks|cross|debug|devices|dump|guard|log|platform|timeout|trace"
+)
 PORTABLE = "x86-64 with AVX2, portable"  # instead of a processor's model
 
 
@@ -50,7 +55,7 @@ def describe_process(
     about = {"platform": device.platform, "kind": _device_kind(device)}
     if device.platform == "cpu":  # XLA's pool size changes the bits of matrix products on a CPU
         about["threads"] = max(cpu_threads(), jax.local_device_count())
-    options = jax.config.values
+    options = sorted(jax.config.values.items())
     return (
         {
             "versions": {"python": platform.python_version(), "libc": "-".join(platform.libc_ver())}
@@ -60,11 +65,8 @@ def describe_process(
             "devices": jax.device_count() if num_shards > 1 else 1,
             "engine": engine,
             "kernels": kernels,
-            "matmul_precision": options["jax_default_matmul_precision"] or "default",
-            "x64": options["jax_enable_x64"],
-            "prng": options["jax_default_prng_impl"],
-            "threefry_partitionable": options["jax_threefry_partitionable"],
             "flags": _flags(),
+            "jax": {n: str(x) for n, x in options if not HARMLESS.search(n)},
             "source": source_hashes(builders),
         }
         | exactness(engine, kernels, inexact)
@@ -101,8 +103,6 @@ def with_unordered(facts: dict[str, Any], places: Iterable[str]) -> dict[str, An
 def _flags() -> dict[str, str]:
     """Returns the environment variables that bits depend on, without what says how many devices."""
     found = {name: os.environ[name] for name in FLAGS if name in os.environ}
-    if exact.is_portable():
-        found.pop("JAX_PLATFORMS", None)  # a machine with a GPU needs it, another one does not
     if "XLA_FLAGS" in found:
         words = found["XLA_FLAGS"].split()
         found["XLA_FLAGS"] = " ".join(w for w in words if "platform_device_count" not in w)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import RunError, UserError
-from purerl.machine.files import check_object, parse, read_bytes, sync, write_file
+from purerl.machine.files import check_object, open_log, parse, read_bytes, sync, write_file
 
 Record = dict[str, Any]
 LARGEST = 1 << 30  # [bytes]
@@ -50,7 +50,7 @@ class MetricsFile:
           UserError: it does not hold that any more.
         """
         self.path = path
-        self.file = path.open("a+b", buffering=0)
+        self.file = open_log(path, "a+b")
         sync(path.parent)
         self.file.seek(0)
         kept = self.file.read(offset) or b""

@@ -130,7 +130,7 @@ def _choose(run: Folder, update: str, abstract: TrainState, say: Say) -> checkpo
         if score == -math.inf:
             since = " since its last change" * bool(run.manifest.get("allowed_changes"))
             raise UserError(f"No checkpoint in {folder} was evaluated{since}; try latest.")
-    found = list(map(str, run.updates))
+    found = list(map(str, checkpoint_folder.updates(folder)))
     if str(number) not in found:
         valid = ", ".join(["latest", "best", *found])
         raise UserError(f"There is no checkpoint {update!r} in {folder}. Valid: {valid}.")

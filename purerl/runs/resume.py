@@ -17,7 +17,15 @@ from purerl.experiment.source_hashes import hash_code
 from purerl.machine.files import draft_of
 from purerl.ppo.config import Config
 from purerl.runs import manifest
-from purerl.runs.folder import CODE, CONFIG, OURS, Folder, allowed_changes, check_manifest
+from purerl.runs.folder import (
+    CODE,
+    CONFIG,
+    OURS,
+    Folder,
+    allowed_changes,
+    check_manifest,
+    check_no_links,
+)
 
 EDITED = "fingerprint: config.json, manifest.json or experiment.py is not what the run wrote"
 # What a line of a change begins with that may change the reward, or how it is discounted.
@@ -52,9 +60,7 @@ def check_new_or_resume(
 
 def _check_usable(folder: Folder, chosen: Experiment, resume: Resume) -> None:
     """Raises UserError if one folder may not be written."""
-    for name in sorted(folder.links):
-        path = folder.path / name
-        raise UserError(f"{path} is no file of the run, but a link or worse: remove it.")
+    check_no_links(folder)
     if folder.is_begun and not resume:
         raise UserError(f"The run {folder.path} exists{_how_to_begin(folder, chosen)}")
     # Drafts are of a run that was killed while it started.

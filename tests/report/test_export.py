@@ -169,6 +169,7 @@ def test_jax_reads_the_program_in_a_process_without_purerl(kind, place, tmp_path
 
     run, recorded = trained(kind, place)
     assert recorded.difference(policy_jax.write_jax(run, tmp_path / "policy.jax")) < 2e-6
+    assert not re.findall(rb"/[\w./-]+\.py", (tmp_path / "policy.jax").read_bytes())
     seen = recorded.observation
     np.savez(tmp_path / "seen.npz", **(seen if isinstance(seen, dict) else {"": seen}))
     (block,) = [block for block in PYTHON if "deserialize" in block]

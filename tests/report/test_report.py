@@ -11,7 +11,15 @@ from pathlib import Path
 import pytest
 
 from purerl.core.errors import USAGE
-from purerl.report import __main__ as report, html_elements, page_charts, page_media, page_series
+from purerl.report import (
+    __main__ as report,
+    html_elements,
+    page_charts,
+    page_media,
+    page_series,
+    run_reader,
+)
+from purerl.report.page import make_page
 from tests.report import chromium
 from tests.report.test_compare import ROOT, make_run, make_seeds, only_line
 
@@ -213,6 +221,23 @@ def test_a_link_a_pipe_and_what_is_no_picture_are_left_out(tmp_path, monkeypatch
     for line, part in zip(said, ["no regular file", "no image/png", "leaves the run", "260 bytes"],
                           strict=True):  # fmt: skip
         assert part in line
+
+
+def test_a_page_has_no_folder_of_ours(tmp_path):
+    home, there = tmp_path / "my home" / "secret", "/home/secret"
+    more = {"experiment_file": f"{home}/mine.py", "flags": {"XLA_FLAGS": f"--dump={there}/a.txt"}}
+    folders = [make_run(home / f"{seed}", seed, [1.0] * 4, **more) for seed in (1, 2)]
+    with_videos(folders[0], **{"1__png": b"no png, and told with its path"})
+    page = make_page(run_reader.read_runs(folders))
+    assert "secret" not in page and str(tmp_path) not in page
+    assert "--dump=a.txt" in page and "1.png is no image/png" in page
+
+
+def test_a_draft_that_is_a_link_is_not_written_through(tmp_path):
+    target, folder = tmp_path / "target", make_run(tmp_path / "a", 1, [1.0] * 4)
+    (tmp_path / ".report.html.draft").symlink_to(target)
+    read(tmp_path, folder)
+    assert not target.exists()
 
 
 # --- a stranger's folder ---

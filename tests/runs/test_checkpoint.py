@@ -104,6 +104,22 @@ def test_a_bit_flipped_after_reading_is_noticed_and_its_leaf_named(tmp_path, mon
         checkpoint.load_checkpoint(path, abstract())
 
 
+def test_a_checkpoint_that_a_run_deletes_meanwhile_is_no_damage(tmp_path, monkeypatch):
+    said, read = [], array_files.read
+    old, new = save(tmp_path, 1), save(tmp_path, 2)
+    new.rename(tmp_path / "new")
+
+    def late(*arguments):
+        if old.exists():  # the run that goes on saves, and deletes what is being read
+            (tmp_path / "new").rename(new)
+            shutil.rmtree(old)
+        return read(*arguments)
+
+    monkeypatch.setattr(array_files, "read", late)
+    (found,) = checkpoint.newest([tmp_path], abstract(), said.append, rename=False)
+    assert found.meta["update"] == 2 and said == []
+
+
 def test_no_flipped_bit_of_any_file_is_taken(tmp_path):
     path = save(tmp_path, 1)
     random = np.random.default_rng(0)

@@ -75,6 +75,30 @@ def test_the_fingerprint_follows_what_can_change_bits_only():
         assert fingerprint(*other) != mine
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "found"),
+    [
+        ("jax_random_seed_offset", 5, ["jax.jax_random_seed_offset: 0 -> 5"]),
+        ("jax_softmax_custom_jvp", True, ["jax.jax_softmax_custom_jvp: False -> True"]),
+        (
+            "jax_default_matmul_precision",
+            "high",
+            ["jax.jax_default_matmul_precision: None -> high"],
+        ),
+        ("jax_log_compiles", True, []),
+        ("jax_compilation_cache_max_size", 7, []),
+    ],
+)
+def test_an_option_of_jax_that_can_move_bits_is_written_down(option, value, found):
+    before, kept = manifest.describe_process("c", []), jax.config.values[option]
+    jax.config.update(option, value)
+    try:
+        now = manifest.describe_process("c", [])
+    finally:
+        jax.config.update(option, kept)
+    assert manifest.differences(before, now) == found
+
+
 def test_a_manifest_says_whether_the_run_is_exact_and_what_prevents_it(monkeypatch):
     assert manifest.describe_process("c", [])["bit_exact"] is True
     warp = manifest.describe_process("warp", [])

@@ -1,7 +1,7 @@
 """What is planned for: a subject under some settings, or the same under two."""
 
 import dataclasses
-import os
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +11,7 @@ from purerl.core.errors import UserError, check_least
 from purerl.experiment.definition import Experiment
 from purerl.experiment.objects import Setup, build
 from purerl.experiment.settings_json import to_json
+from purerl.machine.files import check_writable
 from purerl.tune import subject
 from purerl.tune.overrides import environment_words
 from purerl.tune.subject import PlanOptions, Subject
@@ -41,13 +42,8 @@ class PlanCommandOptions(PlanOptions):
         """Checks the rules."""
         super().__post_init__()
         check_least(self, ValueError, episodes=1, steps=0)
-        for name, file in (("csv", self.csv), ("json", self.json), ("video", self.video)):
-            if file and file.is_dir():
-                raise ValueError(f"{name} is {file}, a folder; it must be a file.")
-            if file and not os.access(file.absolute().parent, os.W_OK):
-                raise ValueError(
-                    f"{name} is {file}; it must be a file in a folder that exists and is yours."
-                )
+        for file in filter(None, (self.csv, self.json, self.video)):
+            check_writable(file)
         if self.csv is not None and self.csv == self.json:
             raise ValueError(f"csv and json are both {self.csv}; they must be two files.")
         if self.video is not None and self.video.suffix != ".mp4":
@@ -87,7 +83,7 @@ def read(words: Sequence[str], prog: str) -> tuple[Problem, Problem | None, Plan
         place = words.index(AGAINST)
         words, after = words[:place], words[place + 1 :]
     found = subject.find(words, prog)
-    prog = f"{prog} {found.name}"
+    prog = f"{prog} {shlex.quote(found.name)}"
     chosen, options = subject.chosen(found, words[1:], prog, PlanCommandOptions)
     if found.run is None and options.no_policy:
         raise UserError(f"{found.name} is an experiment: --no-policy is for a run's folder.")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import shlex
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -128,7 +129,9 @@ def _read_settings(source: Any, named: str, rest: list[str]) -> Any:
     A wrong option may be near one of ours.
     """
     try:
-        return command_line.from_command_line(source, rest, f"python -m purerl.run {named}")
+        return command_line.from_command_line(
+            source, rest, f"python -m purerl.run {shlex.quote(named)}"
+        )
     except UserError as error:
         wrong = re.match(r"There is no option (\S+)\. All", str(error))
         near = nearest(wrong[1], sorted(OWN)) if wrong else ""

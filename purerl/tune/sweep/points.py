@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import shlex
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -82,7 +83,7 @@ def setting(base: Base, name: str) -> Any:
     if name not in names:
         hint = other_trainers.suggest(name, names)
         said = f"There is no setting {name!r}. {hint}".strip()
-        page = f"python -m purerl.run {base.experiment} --help"
+        page = f"python -m purerl.run {shlex.quote(base.experiment)} --help"
         raise UserError(f"{said} All settings: {page}")
     return names[name]
 
@@ -106,7 +107,7 @@ def read_value(base: Base, name: str, text: str) -> Any:
     one: Any = Annotated[kind, tyro.conf.arg(name=name)]
     alone = dataclasses.make_dataclass("Alone", [("value", one)], frozen=True)
     words = [_bool_word(name, text)] if isinstance(getattr(owner, last), bool) else text.split()
-    prog = f"python -m purerl.run {base.experiment}"
+    prog = f"python -m purerl.run {shlex.quote(base.experiment)}"
     return parse(alone, [f"--{name}", *words], prog, None, WORDS).value
 
 

@@ -4,7 +4,10 @@ All state is in the runs' folders and in the logs. Kill this process in any way:
 which runs are done, goes on with those that were interrupted, and waits for those that still train.
 """
 
+import contextlib
 import os
+import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -14,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import INTERRUPTED, SUCCESS, UserError
-from purerl.machine.files import make_folder
+from purerl.machine.files import make_folder, open_file, open_log, writing
 from purerl.machine.lock import FolderLock
 from purerl.machine.output import printable, warn
 from purerl.machine.signals import handling
@@ -27,7 +30,6 @@ TAIL = 1 << 16  # [bytes] of a log in which its last line is looked for
 LONGEST = 400  # letters of why a job failed
 RUN = ("-m", "purerl.run")
 CORES = 2  # of a run on a CPU, where NPROC says nothing else
-END = "[exit code "  # how the last line of a log begins; one without it was cut by a kill
 PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -87,12 +89,13 @@ def how_it_ended(job: Job) -> Ended:
     if is_done(job):
         return Ended(job, "done")
     lines = _last_lines(job.log)
-    code = lines[-1].removeprefix(END).rstrip("]") if lines and lines[-1].startswith(END) else ""
+    told = re.fullmatch(r"\[exit code (-?\d+)\]", lines[-1] if lines else "")  # whole, not torn
+    code = told[1] if told else ""
     if code in ("", str(INTERRUPTED), str(SUCCESS)):
         return Ended(job, "stopped")
     ours = [i for i, line in enumerate(lines) if line.startswith("purerl: ")]
-    told = lines[ours[-1] : -1] if ours else lines[-2:-1]  # ours may have lines below it
-    said = " ".join(told).removeprefix("purerl: ")[:LONGEST] or "it said nothing"
+    why = lines[ours[-1] : -1] if ours else lines[-2:-1]  # ours may have lines below it
+    said = " ".join(why).removeprefix("purerl: ")[:LONGEST] or "it said nothing"
     if code.startswith("-"):
         said = f"killed by {signal.Signals(-int(code)).name}"
     return Ended(job, "failed", said)
@@ -101,7 +104,7 @@ def how_it_ended(job: Job) -> Ended:
 def _last_lines(log: Path) -> list[str]:
     """Returns the last lines of a log, from its last command on."""
     try:
-        with log.open("rb") as file:
+        with open_file(log) as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
             text = file.read().decode(errors="replace")
     except OSError:
@@ -169,10 +172,11 @@ def start(job: Job, more: Mapping[str, str], before: tuple[str, ...] = ()) -> su
       before: words before the command, of a shell that prepares it.
     """
     words = [*RUN, *job.words, "--resume", "auto"]
-    make_folder(job.log.parent)
-    with job.log.open("ab") as log:
-        log.write(f"$ python {' '.join(words)}\n".encode())
-        log.flush()
+    with writing(job.log):
+        make_folder(job.log.parent)
+        log = open_log(job.log)
+        log.write(f"$ {shlex.join(['python', *words])}\n".encode())
+    with log:
         # A session of its own: Ctrl-C in a terminal reaches this process alone, which passes it on.
         # A second one would end the run at once.
         return subprocess.Popen(
@@ -182,9 +186,9 @@ def start(job: Job, more: Mapping[str, str], before: tuple[str, ...] = ()) -> su
 
 
 def end(job: Job, code: int) -> Ended:
-    """Notes in a job's log how its process ended; returns how the job ended."""
-    with job.log.open("ab") as log:
-        log.write(f"{END}{code}]\n".encode())
+    """Notes in a job's log, if it takes that, how its process ended; returns how the job ended."""
+    with contextlib.suppress(OSError), open_log(job.log) as log:
+        log.write(f"[exit code {code}]\n".encode())
     return how_it_ended(job)
 
 

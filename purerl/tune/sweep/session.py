@@ -51,10 +51,10 @@ def execute(arguments: Sequence[str]) -> int:
         points.check_all(base, sweep.points)
     if options.slurm:
         check_installed("submitit", "sweep")
-        slurm.check(options.slurm)
+        slurm.check(options.slurm, base.folder)
     if options.dry_run:
         return _show_commands(sweep)
-    with _begin(sweep):
+    with _begin(sweep), study.kept(base.folder):
         return _submit(sweep) if options.slurm else _carry_out(sweep)
 
 
@@ -81,6 +81,7 @@ def _begin(sweep: Sweep) -> Iterator[None]:
     file = folder / "sweep.json"
     with writing(folder):
         make_folder(folder)
+        run_folder.check_no_links(run_folder.read(folder))
         if not file.exists() and any(not one.name.startswith(".") for one in folder.iterdir()):
             raise UserError(f"{folder} holds no sweep, but other files; use another --name.")
         held = f"The sweep {folder} is being carried out by another process"

@@ -1,5 +1,6 @@
 """Points that Optuna chooses by the scores so far; its own storage keeps them in the folder."""
 
+import contextlib
 import sqlite3
 import warnings
 from collections.abc import Iterator, Sequence
@@ -7,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from purerl.core.errors import UserError, one_line
 from purerl.tune.sweep.points import Point
 from purerl.tune.sweep.spaces import Space
 
@@ -28,6 +30,17 @@ def open_study(folder: Path | None) -> Any:
     return optuna.create_study(
         study_name="sweep", storage=storage, direction="maximize", load_if_exists=True
     )
+
+
+@contextlib.contextmanager
+def kept(folder: Path) -> Iterator[None]:
+    """Turns a disk's refusal of what a sweep's study writes into a UserError."""
+    try:
+        yield
+    except Exception as error:
+        if not {"optuna", "sqlalchemy"} & {type(error).__module__.partition(".")[0]}:
+            raise
+        raise UserError(f"{folder / FILE} cannot be written: {one_line(error):.200}") from error
 
 
 def known(study: Any, spaces: Sequence[Space]) -> list[Point]:

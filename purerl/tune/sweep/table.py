@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from purerl.core.errors import UserError
-from purerl.machine.files import writing
+from purerl.machine.files import as_csv, write_file
 from purerl.machine.output import printable
 from purerl.report import comparison, run_reader
 from purerl.report.seed_statistics import Group, check_scored, summarize
@@ -141,9 +141,8 @@ def write(
     sheet, text, drawn = (folder / f"sweep.{kind}" for kind in ("csv", "txt", "png"))
     names = ["point", *(space.setting for space in spaces)]
     names += ["n", "score", "low", "high", "mean", "worst", "status", "said"]
-    with writing(folder):
-        comparison.write_csv(sheet, names, map(as_record, rows))
-        text.write_text("\n".join(lines) + "\n", errors="backslashreplace")
+    write_file(sheet, as_csv(names, map(as_record, rows)))
+    write_file(text, "".join(f"{printable(line)}\n" for line in lines).encode())
     return [sheet, text, *([drawn] if draw(drawn, rows, spaces, metric) else [])]
 
 

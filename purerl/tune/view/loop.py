@@ -1,6 +1,5 @@
 """The window's clock: plays the session in real time, and has slow work done beside it."""
 
-import errno
 import socket
 import time
 from collections.abc import Callable
@@ -8,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 from purerl.checks.user_code import program_errors
-from purerl.core.errors import RunError, UserError, one_line
+from purerl.core.errors import UserError, one_line
 from purerl.tune.option_numbers import label
 from purerl.tune.view import session as events
 from purerl.tune.view.opening import Source
@@ -26,17 +25,11 @@ LOOK = 2.0  # between two looks for new checkpoints [s]
 
 def check_port(host: str, port: int) -> None:
     """Raises UserError unless the port can be listened on."""
-    if not 0 <= port < 2**16:
-        raise UserError(f"port is {port}; it must be 0 to 65535.")
     try:
-        with socket.socket() as one:
-            one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            one.bind((host, port))
-    except OSError as error:
-        elsewhere = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
-        cure = "an address of this machine, as --host 127.0.0.1"
-        cure = cure if elsewhere else f"another, as --port {port % 60000 + 1}"
-        why = error.strerror or one_line(error)
+        socket.create_server((host, port)).close()
+    except (OSError, OverflowError) as error:
+        why = getattr(error, "strerror", None) or one_line(error)
+        cure = "another --port (0 to 65535), or an address of this machine as --host"
         raise UserError(f"{host}:{port} cannot be listened on ({why}): give {cure}.") from error
 
 
@@ -85,10 +78,8 @@ def begin_work(session: Session, source: Source, beside: Beside) -> None:
     elif numbers := to_build(session):
         fixed = session.program.fixed
         changed = [f"{label(p)} = {numbers[p]:g}" for p in fixed if numbers[p] != fixed[p]]
-        what = f"compiling with {', '.join(changed)}"
-        beside.begin(
-            what, lambda values: (events.take_program, source.program(values)), dict(numbers)
-        )
+        work = lambda values: (events.take_program, source.program(values))  # noqa: E731
+        beside.begin(f"compiling with {', '.join(changed)}", work, dict(numbers))
 
 
 class Pace:
@@ -106,10 +97,8 @@ class Pace:
         """Returns how fast it goes, over the last second; `timestep` of control [s]."""
         seconds = time.perf_counter() - self.since
         if seconds > 1.0:
-            self.said = (
-                f"{self.steps * timestep / seconds:.2f} x real time, "
-                f"{self.frames / seconds:.0f} frames/s"
-            )
+            speed, rate = self.steps * timestep / seconds, self.frames / seconds
+            self.said = f"{speed:.2f} x real time, {rate:.0f} frames/s"
             self.since, self.frames, self.steps = time.perf_counter(), 0, 0
         return self.said
 
@@ -161,5 +150,5 @@ def _advance(session: Session, happened: list[Any]) -> tuple[Session, bool]:
     try:
         with program_errors():
             return advance(session, happened), failed
-    except (RunError, UserError) as error:  # a function of the environment raised
-        return session._replace(playing=False, trouble=str(error), grip=None), failed
+    except Exception as error:  # a function of the environment, a push that no body can take
+        return session._replace(playing=False, trouble=one_line(error), grip=None), failed

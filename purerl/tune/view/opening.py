@@ -1,6 +1,7 @@
 """What a window begins with, and where it gets the rest; a run is only read."""
 
 import functools
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -63,10 +64,8 @@ def open_window(subject: Subject, chosen: Experiment, options: Any) -> tuple[Ses
 def _of_run(run: Run, chosen: Experiment, options: Any) -> tuple[Session, Source, str]:
     setup, brain = run.restored.setup, jax.device_put(run.state)
     guide = functools.partial(planner.guide, setup.config, setup.network)
-    if options.drive == "planner":
-        driver = planner_driver(options, guide, brain)
-    else:
-        driver = policy_driver(guide, brain)
+    planned = options.drive == "planner"
+    driver = planner_driver(options, guide, brain) if planned else policy_driver(guide, brain)
 
     def other_brain(name: str) -> tuple[TrainState, str]:
         saved = read_checkpoint(run.folder, name, setup, show)
@@ -74,10 +73,8 @@ def _of_run(run: Run, chosen: Experiment, options: Any) -> tuple[Session, Source
 
     written = run.restored.source.experiment
     source = _source(setup, driver, brain, written, chosen, command_name(run))
-    source = source._replace(
-        brain=other_brain,
-        checkpoints=lambda: checkpoint_names(run.folder, options.checkpoint),
-    )
+    names = functools.partial(checkpoint_names, run.folder, options.checkpoint)
+    source = source._replace(brain=other_brain, checkpoints=names)
     words = _words(run.update, run.steps)
     title = f"{run.folder.absolute().parent.name}/{run.folder.absolute().name}"
     return _open(source, setup, brain, words, options), source, title
@@ -116,20 +113,16 @@ def _source(
         known = observed if jax.tree.leaves(brain) else None
         return build_program(chosen.build_env, changed, setup.engine, driver, brain, known)
 
-    def words(numbers: Numbers) -> str:
+    def told(numbers: Numbers, words: Callable[[Any], str]) -> str:
         try:
-            return " ".join(overrides.environment_words(written, replaced(chosen.env, numbers)))
+            return words(replaced(chosen.env, numbers))
         except Exception as error:  # a rule of the options, until the sliders are taken back
             return one_line(error)
 
-    def command(numbers: Numbers) -> str:
-        try:
-            changed = replaced(chosen.env, numbers)
-            return overrides.train_command(name, written, chosen, changed)
-        except Exception as error:
-            return one_line(error)
-
-    return Source(program, _no_brain, tuple, words, command)
+    words = lambda env: shlex.join(overrides.environment_words(written, env))  # noqa: E731
+    command = functools.partial(overrides.train_command, name, written, chosen)
+    both = (functools.partial(told, words=one) for one in (words, command))
+    return Source(program, _no_brain, tuple, *both)
 
 
 def _no_brain(name: str) -> tuple[Any, str]:

@@ -5,14 +5,17 @@ What a person does there becomes events of `session.py` in a queue. What the ses
 
 import contextlib
 import io
+import itertools
 import queue
+import secrets
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import viser
 
+from purerl.report.html_elements import Html
 from purerl.tune.option_numbers import Place, bounds, label
-from purerl.tune.view import readouts, session as events
+from purerl.tune.view import gate, readouts, session as events
 from purerl.tune.view.scene import Scene
 from purerl.tune.view.session import Session
 
@@ -28,6 +31,7 @@ PLOTS = {
 }
 AS_IN_FILE = "# as in the experiment's file"  # as high as the overrides of one slider
 PLOT_HEIGHT, PANEL_WIDTH = 190, 380  # [pixels]
+MOST_EVENTS = 1000  # that wait to be played
 
 
 class Page:
@@ -36,8 +40,12 @@ class Page:
     def __init__(self, host: str, port: int, title: str) -> None:
         """Opens the page's server; port 0 is any free one."""
         self.events: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
+        key = secrets.token_urlsafe(16)
+        opened = gate.closed(key, self._find, lambda why: self.put(events.refuse, why))
+        with contextlib.redirect_stdout(io.StringIO()), opened:  # viser prints a banner
             self.server = viser.ViserServer(host, port, label=title, verbose=False)
+        self.port = self.server.get_port()
+        self.address = f"http://{host}:{self.port}/{key}/"
         self.server.gui.configure_theme(show_share_button=False, control_width="large")
         self.scene = Scene(self.server, self.put)
         self.sliders: dict[Place, Any] = {}
@@ -45,11 +53,6 @@ class Page:
         self.plots: dict[str, Any] = {}
         self.names: dict[str, tuple[str, ...]] = {}  # of each plot's lines
         self.checkpoints: Any = None
-
-    @property
-    def port(self) -> int:
-        """Where it listens."""
-        return self.server.get_port()
 
     @property
     def watched(self) -> bool:
@@ -61,8 +64,12 @@ class Page:
         self.server.stop()
 
     def put(self, *event: Any) -> None:
-        """Notes an event of `session.py`: a function, and what it takes."""
-        self.events.put(event)
+        """Notes an event of `session.py`: a function, and what it takes; of a flood, a part."""
+        if self.events.qsize() < MOST_EVENTS:
+            self.events.put(event)
+
+    def _find(self, name: str) -> Any:
+        return self.server.gui._gui_input_handle_from_uuid.get(name)
 
     def happened(self) -> list[Any]:
         """Returns the events since the last call."""
@@ -80,9 +87,8 @@ class Page:
         self.play.on_click(lambda _: put(events.play, self.play.label == "Play"))
         moves = gui.add_button_group("Move on", tuple(MOVES))
         moves.on_click(lambda _: put(MOVES[moves.value]))
-        speed = gui.add_dropdown(
-            "Speed", SPEEDS, initial_value="1", hint="Simulated seconds in a real one"
-        )
+        hint = "Simulated seconds in a real one"
+        speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1", hint=hint)
         speed.on_update(lambda _: put(events.speed, float(speed.value)))
         follow = gui.add_checkbox("Camera follows", True)
         follow.on_update(lambda _: setattr(self.scene, "follows", follow.value))
@@ -91,9 +97,8 @@ class Page:
         seed = gui.add_number("Seed", session.seed, min=0, max=2**32 - 1, step=1)
         seed.on_update(lambda _: put(events.seed, int(seed.value)))
         if checkpoints:
-            self.checkpoints = gui.add_dropdown(
-                "Checkpoint", tuple(checkpoints), initial_value=checkpoints[0]
-            )
+            names, first = tuple(checkpoints), checkpoints[0]
+            self.checkpoints = gui.add_dropdown("Checkpoint", names, initial_value=first)
             self.checkpoints.on_update(lambda _: put(events.choose, self.checkpoints.value))
         self._add_sliders(session)
         self._add_push()
@@ -113,9 +118,9 @@ class Page:
     def _add_sliders(self, session: Session) -> None:
         gui, live = self.server.gui, session.program.live
         with gui.add_folder("Options of the environment"):
-            self.words = gui.add_markdown("This environment's options have no numbers.")
+            self.words = gui.add_html("This environment's options have no numbers.")
             self.train = gui.add_button("Train this", hint="Shows the command that trains it")
-            self.command = gui.add_markdown("", visible=False)
+            self.command = gui.add_html("", visible=False)
             for place in live:
                 self._add_slider(place, session.numbers[place], "acts at once")
         others = [place for place in session.numbers if place not in live]
@@ -142,9 +147,7 @@ class Page:
         panel = self.server.gui.add_panel()
         self.tab = panel.add_tab("Live")
         with self.tab:  # whatever grows is here, so that no button moves under the mouse
-            self.status = self.server.gui.add_markdown("opening")
-            self.trouble = self.server.gui.add_markdown("")
-            self.table = self.server.gui.add_html("")
+            self.said = self.server.gui.add_html("opening")
         self.server.gui.main_panel.dock_right()
         panel.dock_left()
         panel.set_width(PANEL_WIDTH)
@@ -154,7 +157,8 @@ class Page:
 
         @self.train.on_click
         def _(_: Any) -> None:
-            self.command.content, self.command.visible = f"```bash\n{command()}\n```", True
+            _show(self.command, readouts.as_typed(command()))
+            self.command.visible = True
 
     def set_sliders(self, numbers: dict[Place, Any]) -> None:
         """Sets the sliders back to the numbers that are in use."""
@@ -178,11 +182,9 @@ class Page:
           words: the overrides that make the sliders' setting.
         """
         self.play.label = "Pause" if session.playing else "Play"
-        _show(self.status, "  \n".join(readouts.status_lines(session, doing)))
-        _show(self.trouble, f"**{session.trouble}**" if session.trouble else "")
+        _show(self.said, readouts.said(session, doing))
         if self.sliders:
-            _show(self.words, f"```\n{words or AS_IN_FILE}\n```")
-        _show(self.table, readouts.reward_table(session))
+            _show(self.words, readouts.as_typed(words or AS_IN_FILE))
         self._draw_plots(session)
 
     def _draw_plots(self, session: Session) -> None:
@@ -207,14 +209,11 @@ class Page:
 
 def _series(names: Sequence[str]) -> tuple[Any, ...]:
     """Returns how viser's plot is to draw the time and each line."""
-    lines = [
-        {"label": name, "stroke": COLORS[i % len(COLORS)], "width": 1.5}
-        for i, name in enumerate(names)
-    ]
-    return ({"label": "s"}, *lines)
+    each = zip(names, itertools.cycle(COLORS), strict=False)
+    return ({"label": "s"}, *({"label": n, "stroke": color, "width": 1.5} for n, color in each))
 
 
-def _show(element: Any, content: str) -> None:
-    """Sets an element's text, if it is another."""
+def _show(element: Any, content: Html) -> None:
+    """Sets what an element shows, if it is another: by its type no text of a file or a client."""
     if element.content != content:
-        element.content = content
+        element.content = str(content)

@@ -1,12 +1,12 @@
 """What the page says of a session: plots, tables and lines; pure."""
 
-import html
 from typing import NamedTuple
 
 import numpy as np
 
+from purerl.report.html_elements import Html, element, join, table
 from purerl.tune.plan.episodes import TERM
-from purerl.tune.view.session import Row, Session
+from purerl.tune.view.session import Session
 
 MOST_POINTS = 200  # of a plot's line
 RECENT = 1.0  # what "per second" is taken over [s]
@@ -49,45 +49,40 @@ def _plot(session: Session, names: tuple[str, ...], numbers) -> Plot:
     return Plot(names, tuple(np.ascontiguousarray(values.T)))
 
 
-def reward_table(session: Session) -> str:
-    """Returns, as HTML, which term pays for what is shown, and the other metrics."""
+def reward_table(session: Session) -> Html:
+    """Returns which term pays for what is shown, and the other metrics."""
     if not session.rows:
-        return ""
-    recent = [row for row in session.rows if row.time > session.rows[-1].time - RECENT - 1e-9]
-    terms = terms_of(session)
-    others = [name for name in session.sums if name not in terms and name != "reward"]
-    last, whole = session.rows[-1], sum(abs(_mean(recent, term)) for term in terms)
-    lines = [_line("<b>reward</b>", last.reward, _mean(recent, ""), session.sums["reward"], "")]
-    for term in terms:
-        mean = _mean(recent, term)
-        share = f"{mean / whole:+.0%}" if whole > 0 else ""
-        name = html.escape(term.removeprefix(TERM))
-        lines.append(_line(name, last.metrics[term], mean, session.sums[term], share))
-    for name in others:
-        mean = _mean(recent, name)
-        lines.append(_line(f"<i>{html.escape(name)}</i>", last.metrics[name], mean, None, ""))
-    head = "".join(f"<th>{word}</th>" for word in ("", "step", "1 s mean", "episode", "share"))
-    style = 'style="font-size:0.8em;width:100%;text-align:right;padding:0 1em"'
-    return f"<table {style}><tr>{head}</tr>{''.join(lines)}</table>"
+        return join([])
+    last, sums, terms = session.rows[-1], session.sums, terms_of(session)
+    recent = [row for row in session.rows if row.time > last.time - RECENT - 1e-9]
+    mean = {name: float(np.mean([row.metrics[name] for row in recent])) for name in last.metrics}
+    paid, whole = [float(np.mean([row.reward for row in recent]))], sum(abs(mean[t]) for t in terms)
+    share = {term: f"{mean[term] / whole:+.0%}" if whole > 0 else "" for term in terms}
+    rows = [[element("b", "reward"), last.reward, *paid, sums["reward"], ""]]
+    rows += [[t.removeprefix(TERM), last.metrics[t], mean[t], sums[t], share[t]] for t in terms]
+    others = [name for name in sums if name not in terms and name != "reward"]
+    rows += [[element("i", name), last.metrics[name], mean[name], "", ""] for name in others]
+    shown = [[x if isinstance(x, str) else f"{x:.3f}" for x in row] for row in rows]
+    heads = ["", "step", "1 s mean", "episode", "share"]
+    return element("div", table(heads, shown), style="text-align:right")
 
 
-def _mean(rows: list[Row], name: str) -> float:
-    return float(np.mean([row.metrics[name] if name else row.reward for row in rows]))
-
-
-def _line(name: str, now: float, mean: float, total: float | None, share: str) -> str:
-    cells = [f"{now:.3f}", f"{mean:.3f}", "" if total is None else f"{total:.2f}", share]
-    return f"<tr><td>{name}</td>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
-
-
-def status_lines(session: Session, pace: str) -> list[str]:
-    """Returns what is going on, a line each; `pace` says how fast."""
+def said(session: Session, pace: str) -> Html:
+    """Returns what is going on, what went wrong, and the reward; `pace` says how fast it goes."""
     timestep = session.program.env.control_timestep
     doing = pace if session.playing else "paused"
-    return [
+    lines = [
         f"{session.checkpoint}, seed {session.seed}, episode {session.episode}",
         f"{session.length * timestep:.2f} s, step {session.length}, "
         f"return {session.sums.get('reward', 0.0):.4g}",
         doing,
-        *([session.ended] if session.ended else []),
+        session.ended,
+        session.trouble and element("b", session.trouble),
     ]
+    told = (element("div", line) for line in lines if line)
+    return element("div", *told, reward_table(session), style="font-size:0.8em;padding:0 1em")
+
+
+def as_typed(words: str) -> Html:
+    """Returns the words of a command line as they are typed."""
+    return element("pre", words, style="font-size:0.8em;padding:0 1em;white-space:pre-wrap")

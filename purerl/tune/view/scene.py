@@ -96,7 +96,7 @@ class Scene:
             self.put(events.release)
             return
         start, end = (np.array(p) + self.offset for p in (event.start_position, event.end_position))
-        geom = batch.geoms[event.instance_index or 0]
+        geom = batch.geoms[(event.instance_index or 0) % len(batch.geoms)]
         self.put(events.pull, int(self.model.geom_bodyid[geom]), start, end)
 
     def _draw_scenery(self, where: shapes.Layout | None) -> None:
@@ -119,10 +119,8 @@ class Scene:
     def _aim(self) -> None:
         """Sets the camera that a browser begins with: from the side, as far as the body is big."""
         radius = self.stage.radius(0.05)
-        camera, height = (
-            self.server.initial_camera,
-            float(self.data.subtree_com[self.stage.root][2]),
-        )
+        camera = self.server.initial_camera
+        height = float(self.data.subtree_com[self.stage.root][2])
         camera.look_at = (0.0, 0.0, height)
         camera.position = (-0.6 * radius, -2.4 * radius, height + 0.9 * radius)
         camera.near = radius / 100

@@ -172,6 +172,11 @@ def take_brain(session: Session, brain: Any, checkpoint: str) -> Session:
     return session._replace(brain=brain, checkpoint=checkpoint, chosen="", trouble="")
 
 
+def refuse(session: Session, why: str) -> Session:
+    """Tells, in one line, why what a browser sent is not done."""
+    return session._replace(trouble=why)
+
+
 def fail(session: Session, why: str) -> Session:
     """Tells, in one line, why what was asked for could not be had, and takes it back."""
     numbers = session.numbers | session.program.fixed
@@ -201,13 +206,9 @@ def take_step(session: Session) -> Session:
     length = session.length + 1
     why = _end(session, shown, length)
     if not shown.lost:
-        row = Row(
-            time=length * timestep,
-            reward=float(shown.reward),
-            metrics={name: float(value) for name, value in shown.metrics.items()},
-            action=np.asarray(shown.action),
-            value=float(shown.value),
-        )
+        metrics = {name: float(value) for name, value in shown.metrics.items()}
+        action, value = np.asarray(shown.action), float(shown.value)
+        row = Row(length * timestep, float(shown.reward), metrics, action, value)
         session = _with_row(session, row, timestep)._replace(picture=shown.picture)
     session = session._replace(moment=moment, length=length)
     return _finished(session, why, timestep) if why else session._replace(instant=0)
@@ -233,11 +234,8 @@ def _end(session: Session, shown: Shown, length: int) -> str:
 
 def _finished(session: Session, why: str, timestep: float) -> Session:
     """Says how the episode ended, and starts the next; stops where they all end at once."""
-    total = session.sums.get("reward", 0.0)
-    ended = (
-        f"Episode {session.episode} ended after {session.length * timestep:.2f} s ({why}), "
-        f"return {total:.4g}."
-    )
+    total, after = session.sums.get("reward", 0.0), session.length * timestep
+    ended = f"Episode {session.episode} ended after {after:.2f} s ({why}), return {total:.4g}."
     instant = session.instant + 1 if session.length == 1 else 0
     session = start_episode(session, session.episode + 1)._replace(ended=ended, instant=instant)
     if instant < INSTANT:

@@ -76,15 +76,9 @@ def batches(model: mujoco.MjModel) -> dict[str, Batch]:
         for name, chosen in parts.items():
             geoms, sides = (np.array(column) for column in zip(*chosen, strict=True))
             rgba = np.array([_rgba(model, geom) for geom in geoms])
-            found[f"{'body' if moving else 'ground'}/{name}"] = Batch(
-                mesh=_mesh(model, name),
-                shape=name,
-                geoms=geoms,
-                sides=sides,
-                colors=np.asarray(255 * rgba[:, :3], np.uint8),
-                opacities=np.asarray(rgba[:, 3], np.float32),
-                moving=moving,
-            )
+            colors, opacities = (255 * rgba[:, :3]).astype(np.uint8), rgba[:, 3].astype(np.float32)
+            batch = Batch(_mesh(model, name), name, geoms, sides, colors, opacities, moving)
+            found[f"{'body' if moving else 'ground'}/{name}"] = batch
     return found
 
 

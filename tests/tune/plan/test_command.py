@@ -89,8 +89,8 @@ def test_rewards_of_two_settings_are_not_compared():
         (["cartpole_swingup", "--sample", "8"], "There is no option --sample. Did you mean --samp"),
         (["cartpole_swingup", "--knots", "1"], "knots is 1; it must be at least 2."),
         (["cartpole_swingup", "--episodes", "0"], "episodes is 0; it must be at least 1."),
-        (["cartpole_swingup", "--csv", "no/such.csv"], "must be a file in a folder that exists"),
-        (["cartpole_swingup", "--csv", "tests"], "csv is tests, a folder; it must be a file."),
+        (["cartpole_swingup", "--csv", "no/such.csv"], "no/such.csv cannot be written: is "),
+        (["cartpole_swingup", "--csv", "tests"], "tests cannot be written: is "),
         (["cartpole_swingup", "--csv", "a", "--json", "a"], "csv and json are both a"),
         (["cartpole_swingup", "--no-policy"], "is an experiment: --no-policy is for a run's"),
         (

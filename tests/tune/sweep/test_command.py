@@ -1,14 +1,16 @@
 """`python -m purerl.sweep`: its command line and file, checked before anything is started."""
 
 import shlex
+from pathlib import Path
 
 import pytest
 
 import purerl
-from purerl import run, sweep
+from purerl import UserError, run, sweep
 from purerl.core.errors import SUCCESS, USAGE
 from purerl.experiment.command_line import from_command_line
 from purerl.experiment.loading import find_source
+from purerl.tune.sweep import slurm
 from tests.training.test_run import TOY
 
 FILE = f"""
@@ -138,6 +140,42 @@ def test_without_the_package_there_is_a_line_to_paste(package, capsys, monkeypat
     assert (
         capsys.readouterr().err == f"purerl: The package {package} is not installed; run: {line}\n"
     )
+
+
+@pytest.mark.parametrize("name", ["sweep.csv", "sweep.txt", "sweep.png", ".lock", "optuna.db"])
+def test_a_link_in_its_folder_is_refused(capsys, place, name):
+    folder, target = place / "sweeps/toy_experiment", place / "target"
+    folder.mkdir(parents=True)
+    (folder / name).symlink_to(target)
+    assert sweep.main([str(TOY), "--grid", "ppo.gamma=0.9"]) == USAGE
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{name} is no file, but a link or worse: remove it." in line and not target.exists()
+
+
+def test_a_pattern_of_slurm_in_its_name_is_refused():
+    with pytest.raises(UserError, match="sweeps/a%j has a %, which SLURM reads as a pattern"):
+        slurm.check("timeout_min=5", Path("sweeps/a%j"))
+    slurm.check("timeout_min=5,cluster=local", Path("sweeps/a%j"))
+
+
+def test_what_a_refusal_says_to_paste_is_quoted(capsys, place):
+    (place / "my toy.py").write_text(TOY.read_text())
+    for words in (["--grid", "ppo.lr=1"], ["--grid", "ppo.gamma=x"], ["--nothing", "1"]):
+        assert sweep.main(["my toy.py", *words]) == USAGE
+        assert "python -m purerl.run 'my toy.py' --help" in capsys.readouterr().err
+    assert run.main(["my toy.py", "--nothing", "1"]) == USAGE
+    assert "python -m purerl.run 'my toy.py' --help" in capsys.readouterr().err
+
+
+def test_a_study_that_the_disk_refuses_is_one_line(place):
+    from purerl.tune.sweep import study
+
+    optuna = pytest.importorskip("optuna")
+    refused = pytest.raises(UserError, match="a/optuna.db cannot be written: .*disk is full")
+    with refused, study.kept(Path("a")):
+        raise optuna.exceptions.StorageInternalError("database or disk is full")
+    with pytest.raises(ZeroDivisionError), study.kept(Path("a")):
+        raise ZeroDivisionError
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from purerl import UserError
 from purerl.machine.lock import FolderLock
 from purerl.tune.sweep import scheduler
 from purerl.tune.sweep.scheduler import Job, environment_of, find_gpus, jobs_at_once
@@ -32,6 +33,30 @@ def carry_out(jobs, at_once: int = 2, gpus=(), began=None) -> dict:
 def begun(one: Job) -> int:
     """Returns how often a job was started."""
     return one.log.read_text().count("$ python ")
+
+
+@pytest.mark.parametrize("last", ["[exit code -", "[exit code 1", "[exit code ]", "[exit co", "x"])
+def test_a_torn_last_line_of_a_log_is_of_a_job_that_was_cut(place, last):
+    one = job("a")
+    one.log.parent.mkdir()
+    one.log.write_text(f"$ python -m purerl.run\npurerl: wrong\n{last}")
+    assert scheduler.how_it_ended(one).status == "stopped"
+    one.log.write_text("$ python -m purerl.run\npurerl: wrong\n[exit code 1]\n")
+    assert scheduler.how_it_ended(one) == (one, "failed", "wrong")
+
+
+def test_a_log_that_the_disk_refuses_is_one_line(place, monkeypatch):
+    one = job("a")
+    one.log.parent.mkdir()
+    one.log.symlink_to("/dev/full")
+    with pytest.raises(UserError, match=r"logs/a.log cannot be written: Too many levels of symb"):
+        scheduler.start(one, {})
+    assert scheduler.end(one, 0).status == "stopped"
+    assert scheduler.how_it_ended(one).said == ""  # a device has no end
+    monkeypatch.setattr(scheduler, "open_log", lambda _: open("/dev/full", "ab", 0))  # noqa: SIM115
+    with pytest.raises(UserError, match=r"logs/a.log cannot be written: No space left on device"):
+        scheduler.start(one, {})
+    assert scheduler.end(one, 0).status == "stopped"
 
 
 @pytest.mark.slow

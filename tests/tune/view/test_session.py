@@ -197,9 +197,9 @@ def test_what_is_no_event_is_refused():
 def test_the_table_says_which_term_pays():
     session = s.advance(opened(), [(s.tick, 0.1)])
     table = readouts.reward_table(session)
-    assert "<td>run</td><td>4.000</td><td>4.000</td><td>20.00</td><td>+67%</td>" in table
-    assert "<td>cost</td><td>-2.000</td><td>-2.000</td><td>-10.00</td><td>-33%</td>" in table
-    assert "<i>speed</i></td><td>7.000</td>" in table
+    assert ">run</th><td>4.000</td><td>4.000</td><td>20.000</td><td>+67%</td>" in table
+    assert ">cost</th><td>-2.000</td><td>-2.000</td><td>-10.000</td><td>-33%</td>" in table
+    assert "<i>speed</i></th><td>7.000</td>" in table
     assert readouts.reward_table(opened()) == ""
 
 
@@ -217,8 +217,13 @@ def test_plots_have_a_line_each_and_few_points():
 
 def test_the_state_is_told_in_lines():
     session = s.advance(opened(3), [(s.tick, 0.1)])
-    lines = readouts.status_lines(session, "1.00 x real time")
-    assert lines[0] == "first, seed 3, episode 1"
-    assert lines[1] == "0.04 s, step 2, return 4"
-    assert lines[2] == "1.00 x real time"
-    assert lines[3] == session.ended
+    shown = readouts.said(session, "1.00 x real time")
+    lines = ["first, seed 3, episode 1", "0.04 s, step 2, return 4", "1.00 x real time"]
+    assert all(f"<div>{line}</div>" in shown for line in [*lines, session.ended])
+
+
+def test_what_is_said_is_text_whatever_a_file_has_in_it():
+    hostile = "<iframe srcdoc='x'></iframe>**a**"
+    session = opened()._replace(checkpoint=hostile, trouble=hostile, ended=hostile)
+    for shown in (readouts.said(session, hostile), readouts.as_typed(hostile)):
+        assert "<iframe" not in shown and "&lt;iframe srcdoc=" in shown and "**a**" in shown
