@@ -44,7 +44,7 @@ MAY_IMPORT = {
         "runs",
         "training",
     },
-    "adapters": {"core", "ppo", "physics"},
+    "adapters": {"core", "ppo", "physics", "report"},
     "tune": {
         "core",
         "ppo",

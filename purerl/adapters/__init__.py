@@ -1,6 +1,6 @@
 """Adapters: our environments as those of other libraries, and theirs as ours.
 
-May import: core, ppo, physics. Read: `stepping.py`, then the file of the library that you want.
+May import: core, ppo, physics, report. Read: `stepping.py`, then the file of your library.
 
   gymnasium_env(env), gymnasium_vector_env(env, number): for `gymnasium`.
   dm_env_environment(env): for `dm_env`.

@@ -6,7 +6,6 @@ far. So a process that resumes a run cannot go on with its episodes: they count 
 anew. The run's plan says so.
 """
 
-import difflib
 import functools
 import sys
 import threading
@@ -23,14 +22,13 @@ import numpy as np
 
 from purerl.adapters.foreign import Drawn, float32
 from purerl.core.env import State
-from purerl.core.errors import unknown_name
+from purerl.core.errors import one_line
 from purerl.core.records import Array
 from purerl.physics.interface import PhysicsState
 
 _DRAWN = ("qpos", "qvel", "act", "qacc_warmstart", "mocap_pos", "mocap_quat")
-_FEW = 5  # of Gymnasium's names, told to who misspells one
 _INEXACT = "the environment keeps state of its own: a resumed run begins its episodes anew, as lost"
-_STANDS = 0.05  # simulated seconds of a step, where an environment does not say [s]
+_RATE = 20  # steps of a simulated second, where an environment does not say
 
 
 @dataclass(frozen=True)
@@ -54,21 +52,20 @@ def from_gymnasium(
     Raises:
       ValueError: Gymnasium has none of that name, or its spaces are not those of `from_maker`.
     """
-    if options.name not in gymnasium.registry:
-        package, slash, _ = options.name.partition("/")
-        if slash:
-            raise ValueError(
-                f"There is no environment of Gymnasium {options.name!r}: install and import the "
-                f"package that brings {package}, or build it by from_maker."
-            )
-        near = difflib.get_close_matches(options.name, gymnasium.registry, _FEW, cutoff=0)
-        message = unknown_name("environment of Gymnasium", options.name, near)
-        raise ValueError(message.removesuffix(".") + ", ...")
+    try:
+        gymnasium.spec(options.name)
+    except (
+        gymnasium.error.Error
+    ) as error:  # it names what is near, or a package that is not imported
+        what = f"There is no environment of Gymnasium {options.name!r}"
+        raise ValueError(f"{what}: {one_line(error)}") from error
     return from_maker(lambda: gymnasium.make(options.name, max_episode_steps=-1))
 
 
 def from_maker(make: Callable[[], gymnasium.Env]) -> "HostEnv":
     """Returns any environment of Gymnasium as ours: `build_env` can end with it.
+
+    Our actions in [-1, 1] become its own between its limits; for a Box of integers, the nearest.
 
     Args:
       make: makes one. As many are made as episodes run at once.
@@ -80,17 +77,12 @@ def from_maker(make: Callable[[], gymnasium.Env]) -> "HostEnv":
     pool = _Pool(make)
     space, bare = pool.example.action_space, pool.example.unwrapped
     if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
-        raise ValueError(
-            f"Its actions are {space}; this trainer's are a vector: a Box of one axis."
-        )
+        raise ValueError(f"Its actions are {space}; here they are a vector: a Box of one axis.")
     if not np.isfinite([space.low, space.high]).all():
         raise ValueError(f"Its actions are {space}; [-1, 1] is mapped to limits: they are finite.")
     if not pool.example.observation_space.is_np_flattenable:
-        raise ValueError(
-            f"It observes {pool.example.observation_space}, which is no vector of numbers."
-        )
-    rate = bare.metadata.get("render_fps")
-    seconds = float(getattr(bare, "dt", 0) or (1 / rate if rate else _STANDS))
+        raise ValueError(f"It observes {pool.example.observation_space}: no vector of numbers.")
+    seconds = float(getattr(bare, "dt", 0) or 1 / (bare.metadata.get("render_fps") or _RATE))
     model = getattr(bare, "model", None)
     drawn = Drawn(model) if isinstance(model, mujoco.MjModel) else None
     return HostEnv(pool, drawn, space.shape[0], seconds)
@@ -215,7 +207,9 @@ class _Pool:
         if episode.steps != step - 1:  # of the past
             return np.full(self.width, np.nan, np.float32)
         scaled = self.low + (np.clip(action, -1, 1) + 1) / 2 * (self.high - self.low)
-        *found, _ = episode.env.step(scaled.astype(self.example.action_space.dtype))
+        kind = self.example.action_space.dtype
+        scaled = np.rint(scaled) if np.issubdtype(kind, np.integer) else scaled
+        *found, _ = episode.env.step(scaled.astype(kind))
         episode.row = self._row(episode.env, *found)
         episode.steps, episode.action = int(step), action.tobytes()
         episode.over = bool(found[2] or found[3])

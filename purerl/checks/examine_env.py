@@ -11,7 +11,7 @@ from purerl.checks import check_env
 from purerl.checks.check_traces import check_traces
 from purerl.checks.examine_model import check_model
 from purerl.checks.findings import Finding, error, ok, some, warning
-from purerl.checks.user_code import in_words, own_line
+from purerl.checks.user_code import in_words, own_line, program_errors
 from purerl.checks.watch_physics import check_controls, check_placed
 from purerl.core.env import ABSURD, Env, EnvError, State
 from purerl.core.errors import one_line
@@ -38,7 +38,8 @@ def examine(env: Env, num_steps: int = NUM_STEPS) -> Iterator[Finding]:
         what = f"reset or step sets env.{changed[0]}, and a compiled program does so only once"
         yield error("own state", f"{what}: what an episode must remember goes into State.task.")
     try:
-        trial = check_env.try_out(env, max(NUM_ENVS, env.action_size + 1), num_steps)
+        with program_errors():  # of a callback
+            trial = check_env.try_out(env, max(NUM_ENVS, env.action_size + 1), num_steps)
     except Exception as failed:
         yield error("steps", f"it cannot be stepped: {in_words(failed)}{own_line(failed)}")
         return

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from jax._src import dispatch  # JAX has no public way to forget a callback that failed
+from jax._src import callback, dispatch  # JAX has no public way to forget one that failed
 
 from purerl.core.errors import RunError, UserError, one_line
 
@@ -99,6 +99,7 @@ def program_errors() -> Iterator[None]:
     Raises:
       RunError: the program failed for one of the two.
     """
+    callback.logger.disabled = True  # it would print a traceback besides
     try:
         yield
     except (RunError, UserError):  # told already: of a full disk, by the words of a full memory

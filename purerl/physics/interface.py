@@ -130,6 +130,10 @@ class Physics:
         record: Any = collections.namedtuple("Readings", list(readings))  # type: ignore[misc]
         self._engine = _build_engine(self.engine, model, record, substeps)
 
+    def __deepcopy__(self, memo: dict) -> "Physics":
+        """Returns itself: nothing in it changes."""
+        return self
+
     def init(
         self,
         qpos: Array,

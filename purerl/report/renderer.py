@@ -58,6 +58,7 @@ class Renderer(contextlib.AbstractContextManager):
     def draw(self, picture: Picture) -> np.ndarray:
         """Draws one state, given as numpy arrays; returns [height, width, 3] uint8."""
         stage, everything = self.stage, mujoco.mjtCatBit.mjCAT_ALL.value
+        self.gl.make_current()  # another one may draw in the same process
         stage.pose(picture)
         mujoco.mjv_updateScene(
             stage.model, stage.data, self.option, None, stage.camera, everything, self.scene

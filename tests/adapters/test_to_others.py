@@ -1,5 +1,6 @@
 """Our environments as Gymnasium's and dm_env's."""
 
+import copy
 import dataclasses
 import subprocess
 import sys
@@ -137,6 +138,53 @@ def test_a_vector_begins_anew_in_the_step_after_the_end():
     assert env.observation_space.contains(seen[0])
 
 
+def test_what_was_not_reset_says_so():
+    gymnasium = pytest.importorskip("gymnasium")
+    for env in (adapters.gymnasium_env(Toy()), adapters.gymnasium_vector_env(Toy(), 2)):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="Call reset"):
+            env.step(np.zeros((2, 1), np.float32))
+        with pytest.raises(gymnasium.error.ResetNeeded, match="Call reset"):
+            adapters.gymnasium_vector_env(Toy(), 2).reset(
+                options={"reset_mask": np.array([True, False])}
+            )
+
+
+def test_a_vector_takes_a_seed_for_each():
+    pytest.importorskip("gymnasium")
+    many, one = adapters.gymnasium_vector_env(Toy(), 3), adapters.gymnasium_env(Toy())
+    seen, _ = many.reset(seed=[4, None, 7])
+    for place, seed in ((0, 4), (2, 7)):
+        np.testing.assert_array_equal(seen[place], one.reset(seed=seed)[0])
+    again, _ = many.reset(seed=[4, None, 7])
+    assert (again == seen).tolist() == [[True], [False], [True]]
+    with pytest.raises(purerl.UserError, match="seed has 2 entries for 3"):
+        many.reset(seed=[1, 2])
+
+
+def test_a_vector_begins_those_of_a_mask_anew():
+    pytest.importorskip("gymnasium")
+    env = adapters.gymnasium_vector_env(Toy(), 2, episode_length=2)
+    before, _ = env.reset(seed=1)
+    env.step(np.full((2, 1), 0.5, np.float32))
+    seen, _ = env.reset(seed=[5, None], options={"reset_mask": np.array([True, False])})
+    assert 0 <= seen[0, 0] < 1 and seen[1] == before[1] + 1
+    *_, truncated, _ = env.step(np.full((2, 1), 0.5, np.float32))
+    assert truncated.tolist() == [False, True]  # the time of the other one goes on
+    with pytest.raises(purerl.UserError, match="reset_mask has 1 entries for 2"):
+        env.reset(options={"reset_mask": np.array([True])})
+
+
+def test_an_environment_is_copied_with_its_episode():
+    pytest.importorskip("gymnasium")
+    env = adapters.gymnasium_env(cartpole(), episode_length=3)
+    env.reset(seed=4)
+    twin = copy.deepcopy(env)
+    env.step([1.0])
+    seen = [one.step([0.3])[0] for one in (twin, twin, env)]
+    np.testing.assert_array_equal(twin.env.physics.model.qpos0, env.env.physics.model.qpos0)
+    assert twin.steps == 2 == env.steps and np.abs(seen[1] - seen[2]).max() > 1e-3
+
+
 def test_a_vector_has_the_time_limit_of_each():
     pytest.importorskip("gymnasium")
     env = adapters.gymnasium_vector_env(cartpole(), 2, episode_length=2)
@@ -176,14 +224,11 @@ def test_mistakes_are_one_line():
     with pytest.raises(AttributeError, match="has no 'gymnasium'; it has Brax.*, dm_env_env"):
         adapters.gymnasium  # noqa: B018
     pytest.importorskip("gymnasium")
-    with pytest.raises(purerl.UserError, match="cannot be drawn: it has no physics.model"):
+    with pytest.raises(purerl.UserError, match="Toy cannot be drawn"):
         adapters.gymnasium_env(Toy(), render_mode="rgb_array")
 
 
 DRAW = """
-import os
-from purerl.report.opengl import choose_gl
-os.environ["MUJOCO_GL"] = choose_gl()
 from purerl.envs import cartpole_swingup
 from purerl import adapters
 env = adapters.gymnasium_env(cartpole_swingup.build(), render_mode="rgb_array")
@@ -207,9 +252,6 @@ def test_it_is_drawn():
 
 
 DRAW_GAPS = """
-import os
-from purerl.report.opengl import choose_gl
-os.environ["MUJOCO_GL"] = choose_gl()
 import jax
 import numpy as np
 from purerl.envs import run
@@ -219,18 +261,18 @@ env = run.build(run.Options(arena="gaps"), "c")
 drawn = adapters.gymnasium_env(env, render_mode="rgb_array")
 boxes = list(env.parts.boxes.boxes)
 for seed in (0, 1):
-    drawn.drawer.stage.followed_height = 5.0  # of the episode before
+    drawn.renderer.stage.followed_height = 5.0  # of the episode before
     drawn.reset(seed=seed)
-    print(drawn.drawer.stage.followed_height is None)
+    print(drawn.renderer.stage.followed_height is None)
     drawn.step(np.zeros(env.action_size))
     drawn.render()
     true = env.model_changes(drawn.state)
-    data, model = drawn.drawer.stage.data, drawn.drawer.stage.model
+    data, model = drawn.renderer.stage.data, drawn.renderer.stage.model
     # Where they are drawn, not where a model would put them.
     print(abs(data.geom_xpos[boxes] - true["geom_pos"][np.array(boxes)]).max() < 1e-6)
     print(abs(model.geom_size[boxes] - true["geom_size"][np.array(boxes)]).max() < 1e-6)
     print(abs(true["geom_pos"] - env.physics.model.geom_pos).max() > 1)
-    scene, course = drawn.drawer.renderer.scene, env.scenery(drawn.state)[0]
+    scene, course = drawn.renderer.scene, env.scenery(drawn.state)[0]
     far = [scene.geoms[scene.ngeom - len(course) + i].pos for i in range(len(course))]
     print(abs(np.array(far) - course).max() < 1e-5)
     eyes = np.mean([eye.pos for eye in scene.camera], axis=0)
