@@ -9,16 +9,14 @@ A run's folder is only read, and may be training meanwhile.
 """
 
 import functools
-import importlib.util
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import purerl
 from purerl.core.errors import UserError
 from purerl.experiment.command_line import main_of_words
-from purerl.machine.command_errors import leave
+from purerl.machine.command_errors import check_installed, leave
 from purerl.machine.output import show
 from purerl.tune.subject import PlanOptions, chosen as settings_of, find, show_help
 
@@ -39,19 +37,12 @@ class ViewOptions(PlanOptions):
     """The port to listen on."""
 
 
-def has_viser() -> bool:
-    """Tells whether the package that draws in the browser is installed."""
-    return importlib.util.find_spec("viser") is not None
-
-
 def command(words: Sequence[str]) -> None:
     """Opens the page and plays until Ctrl-C."""
     found = find(words, PROG)
-    chosen, options = settings_of(
-        found, words[1:], f"{PROG} {shlex.quote(found.name)}", ViewOptions
-    )
-    if not has_viser():  # its help needs no window
-        raise UserError(f"The window needs the package viser: {purerl.how_to_install('view')}")
+    prog = f"{PROG} {shlex.quote(found.name)}"
+    chosen, options = settings_of(found, words[1:], prog, ViewOptions)
+    check_installed("viser", "view")  # its help needs no window
     from purerl.tune.view import opening
     from purerl.tune.view.loop import check_port, play
     from purerl.tune.view.page import Page

@@ -4,7 +4,6 @@ One HTML file: curves, every metric, evaluations, settings, videos. It needs no 
 browser opens it; hover for values. Nothing of the runs is executed.
 """
 
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -37,8 +36,7 @@ def command(options: ReportOptions) -> None:
     from purerl.report.run_reader import read_runs
 
     if options.out.is_dir():
-        instead = shlex.quote(str(options.out / "a.html"))
-        raise UserError(f"{options.out} is a folder: give a file, as --out {instead}.")
+        raise UserError(f"{options.out} is a folder: give a file, as --out report.html.")
     runs = read_runs(options.runs, "report")
     page = make_page(runs, options.group_by).encode()
     write_answer(options.out, page)

@@ -16,16 +16,8 @@ from purerl.experiment.options import Resume
 from purerl.experiment.source_hashes import hash_code
 from purerl.machine.files import draft_of
 from purerl.ppo.config import Config
-from purerl.runs import manifest
-from purerl.runs.folder import (
-    CODE,
-    CONFIG,
-    OURS,
-    Folder,
-    allowed_changes,
-    check_manifest,
-    check_no_links,
-)
+from purerl.runs import folder as run_folder, manifest
+from purerl.runs.folder import CODE, CONFIG, OURS, Folder, allowed_changes, check_manifest
 
 EDITED = "fingerprint: config.json, manifest.json or experiment.py is not what the run wrote"
 # What a line of a change begins with that may change the reward, or how it is discounted.
@@ -60,7 +52,7 @@ def check_new_or_resume(
 
 def _check_usable(folder: Folder, chosen: Experiment, resume: Resume) -> None:
     """Raises UserError if one folder may not be written."""
-    check_no_links(folder)
+    run_folder.check_no_links(folder)
     if folder.is_begun and not resume:
         raise UserError(f"The run {folder.path} exists{_how_to_begin(folder, chosen)}")
     # Drafts are of a run that was killed while it started.

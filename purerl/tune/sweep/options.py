@@ -129,9 +129,8 @@ def _read_settings(source: Any, named: str, rest: list[str]) -> Any:
     A wrong option may be near one of ours.
     """
     try:
-        return command_line.from_command_line(
-            source, rest, f"python -m purerl.run {shlex.quote(named)}"
-        )
+        prog = f"python -m purerl.run {shlex.quote(named)}"
+        return command_line.from_command_line(source, rest, prog)
     except UserError as error:
         wrong = re.match(r"There is no option (\S+)\. All", str(error))
         near = nearest(wrong[1], sorted(OWN)) if wrong else ""

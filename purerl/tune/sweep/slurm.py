@@ -63,11 +63,10 @@ def parameters(text: str) -> dict[str, int | str]:
 
 def check(text: str, folder: Path) -> None:
     """Raises UserError unless the parameters can be read, and there is a SLURM to take jobs."""
-    if parameters(text).get("cluster", "slurm") != "slurm":
-        return
-    if "%" in str(folder.absolute()):
+    is_slurm = parameters(text).get("cluster", "slurm") == "slurm"
+    if is_slurm and "%" in str(folder.absolute()):
         raise UserError(f"{folder} has a %, which SLURM reads as a pattern: use another --name.")
-    if shutil.which("sbatch") is None:
+    if is_slurm and shutil.which("sbatch") is None:
         raise UserError(
             "There is no SLURM on this machine (no sbatch): give the command on a login node, or "
             "try it here with --slurm cluster=local."

@@ -11,11 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from purerl import view
 from tests.report import chromium
 
-if not view.has_viser():
-    pytest.skip("pip install -e '.[view]'", allow_module_level=True)
+pytest.importorskip("viser", reason="pip install -e '.[view]'")
 
 from websockets.exceptions import InvalidStatus
 

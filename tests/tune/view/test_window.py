@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import importlib.util
 import json
 import shutil
 import subprocess
@@ -30,7 +31,9 @@ from tests.tune.view import sled_experiment as sled
 ROOT = Path(__file__).parent.parent.parent.parent
 # A browser without a GPU draws by a program of its own.
 GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-needs_viser = pytest.mark.skipif(not view.has_viser(), reason="pip install -e '.[view]'")
+needs_viser = pytest.mark.skipif(
+    importlib.util.find_spec("viser") is None, reason="pip install -e '.[view]'"
+)
 needs_chromium = pytest.mark.skipif(
     chromium.find() is None, reason="no Chromium here: apt-get install chromium"
 )
@@ -154,7 +157,9 @@ def test_the_sliders_begin_where_the_command_line_puts_them(trained, of):
 
 
 def test_help_needs_no_package_that_draws(monkeypatch, capsys):
-    monkeypatch.setattr(view, "has_viser", lambda: False)
+    find = importlib.util.find_spec
+    absent = lambda name, *of: None if name == "viser" else find(name, *of)  # noqa: E731
+    monkeypatch.setattr("importlib.util.find_spec", absent)
     with pytest.raises(SystemExit, match="^0$"):
         view.main(["cartpole_swingup", "--help"])
     assert "--horizon" in capsys.readouterr().out
