@@ -24,6 +24,7 @@ PACKAGE = Path(__file__).parent.parent
 # it or look at it. The modules of rooms that compute only raise errors or word them.
 LEFT_OUT = {"checks", "experiment", "machine", "report", "runs", "training", "tune"}
 LEFT_OUT |= {
+    "adapters.to_gymnasium",
     "core.errors",
     "devices.check_sizes",
     "devices.memory",

@@ -92,13 +92,14 @@ def test_a_result_of_another_shape_is_an_error():
 
 def test_engines_that_differ_in_anything_do_not_answer_for_each_other():
     light, heavy = pendulum(), pendulum(mass=2.0)
+    physics = Physics(light, (), 2, "c")
     got = {
-        "light": swing(Physics(light, (), 2, "c")),
+        "light": swing(physics),
         "heavy": swing(Physics(heavy, (), 2, "c")),
         "longer": swing(Physics(light, (), 3, "c")),
         "with readings": swing(Physics(light, ("xpos",), 2, "c")),
         "changed": swing(Physics(light, (), 2, "c"), {"dof_damping": jnp.full(1, 5.0)}),
-        "changed otherwise": swing(Physics(light, (), 2, "c"), {"dof_armature": jnp.full(1, 5.0)}),
+        "changed otherwise": swing(physics, physics.derive({"dof_armature": jnp.full(1, 5.0)})),
     }
     damped, slow = pendulum(), pendulum()
     damped.dof_damping[:], slow.dof_armature[:] = 5.0, 5.0
