@@ -99,18 +99,18 @@ def test_no_engine_is_traced_so_that_all_have_the_same_hashes():
 def test_arrays_that_change_the_model_count(network):
     env = cartpole_swingup.build(engine="c")
 
-    class Heavier:
+    class Damped:
         control_timestep, action_size = env.control_timestep, env.action_size
         reset = staticmethod(env.reset)
 
-        def __init__(self, masses):
-            self.physics, self.masses = env.physics, masses
+        def __init__(self, damping):
+            self.physics, self.damping = env.physics, damping
 
         def step(self, state, action):
-            changes = {"body_mass": self.masses}
+            changes = {"dof_damping": self.damping}
             physics, _ = self.physics.step(state.physics, jnp.zeros(1), changes)
             return state.replace(physics=physics)
 
-    mass = np.asarray(env.physics.model.body_mass, np.float32)
+    damping = np.ones(env.physics.model.nv, np.float32)
     assert isinstance(env.physics, Physics)
-    assert changed(network_of(env), Heavier(mass), Heavier(mass * 2)) == [f"float32[{len(mass)}]"]
+    assert changed(network_of(env), Damped(damping), Damped(damping * 2)) == ["float32[2]"]

@@ -228,7 +228,7 @@ def test_a_page_has_no_folder_of_ours(tmp_path):
     more = {"experiment_file": f"{home}/mine.py", "flags": {"XLA_FLAGS": f"--dump={there}/a.txt"}}
     folders = [make_run(home / f"{seed}", seed, [1.0] * 4, **more) for seed in (1, 2)]
     with_videos(folders[0], **{"1__png": b"no png, and told with its path"})
-    page = make_page(run_reader.read_runs(folders))
+    page = make_page(run_reader.read_runs(folders, "report"))
     assert "secret" not in page and str(tmp_path) not in page
     assert "--dump=a.txt" in page and "1.png is no image/png" in page
 

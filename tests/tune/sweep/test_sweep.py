@@ -300,7 +300,7 @@ def test_submitit_carries_points_out(tmp_path, monkeypatch):
 def test_the_table_tells_what_slurm_has_and_the_exit_code_what_failed(place, monkeypatch):
     """Of three points, all in the queue: one has failed, one has begun and holds no lock yet."""
     words = ["--grid", "ppo.gamma=0.5,0.7,0.9", "--seeds", "1", "--slurm", "timeout_min=1"]
-    monkeypatch.setattr(slurm, "check", lambda text: None)
+    monkeypatch.setattr(slurm, "check", lambda *of: None)
     monkeypatch.setattr(slurm, "submit", lambda *of: (["p0000"], ["p0001", "p0002"]))
     assert start(*words) == SUCCESS
     assert {row["status"] for row in rows()} == {"waiting"}
