@@ -15,7 +15,7 @@ class Config:
     num_envs: int = 64
     """Environments that run in parallel, B."""
     rollout_length: int = 128
-    """Control steps of each environment in one update, T; no push of colored noise lasts longer."""
+    """Control steps of each environment in one update, T; the action noise begins anew there."""
     num_epochs: int = 4
     """Passes over each rollout."""
     num_minibatches: int = 16
@@ -25,7 +25,7 @@ class Config:
     # Where the goal is reached soon, a start is what is to be learned.
     shortest_episode: int = 32
     """Time limit of the first environment's training episodes [control steps]; the others' rise
-    to `episode_length`, evenly in their logarithm. 0, or not below that: all are that long."""
+    to `episode_length`, evenly in their logarithm. 0: all have the limit `episode_length`."""
     gamma: float = 0.99
     """Discount of one control step."""
     gae_lambda: float = 0.95
@@ -34,20 +34,20 @@ class Config:
     """Range of the policy ratio, 1 +- clip."""
     # One fall of a pole that always stood undid a policy.
     advantage_clip: float = 4.0
-    """Range of the normalized advantage, +- so many standard deviations; 0: any."""
+    """Range of the normalized advantage, +- so many standard deviations; 0: no limit."""
     # A policy that has earned nothing yet follows noise.
     min_advantage_std: float = 0.01
-    """Least deviation that advantages are divided by [scaled reward]; 0: any, however small."""
+    """Advantages are divided by their deviation, and by no less than this [scaled reward]."""
     # With white noise, three of five hanging poles never swung up.
     noise_color: float = 0.75
-    """Exponent b of the action noise, of power 1 / f^b: 0 white, 1 pink, whose pushes last."""
+    """Exponent b of the action noise, whose power at frequency f is 1 / f^b: 0 white, 1 pink."""
     value_weight: float = 0.5
     """Weight of the value loss."""
     entropy_weight: float = 0.02
     """Weight of the entropy bonus, a mean over the actions where other trainers have a sum."""
     # Beyond it, a bonus only holds a hopper down.
     entropy_target: float = 0.3
-    """Entropy up to which the bonus counts [nats for each action]; a uniform policy has 0.69."""
+    """Above this entropy there is no bonus [nats for each action]; a uniform policy has 0.69."""
     max_gradient_norm: float = 1.0
     """Gradients are scaled down to this global norm."""
     learning_rate: float = 1e-3

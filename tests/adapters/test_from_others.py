@@ -1,6 +1,9 @@
 """Environments of other libraries behind our protocol."""
 
 import dataclasses
+import importlib
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import jax
@@ -178,6 +181,21 @@ def test_playground_is_stepped_as_by_itself():
         check_env(env)
     with pytest.raises(ValueError, match="CartpoleSwingup"):
         adapters.from_playground(adapters.PlaygroundOptions("Cartpole"))
+
+
+def test_playground_without_a_network_is_one_line(monkeypatch):
+    """Its robots' models are cloned when one is first built."""
+
+    def load(*_, **__):
+        raise subprocess.CalledProcessError(128, ["git", "clone"])
+
+    registry = SimpleNamespace(ALL_ENVS=["Go1"], get_default_config=lambda _: {}, load=load)
+    monkeypatch.setitem(sys.modules, "mujoco_playground", SimpleNamespace(registry=registry))
+    monkeypatch.delitem(sys.modules, "purerl.adapters.playground_envs", raising=False)
+    home = importlib.import_module("purerl.adapters.playground_envs")
+    monkeypatch.delitem(sys.modules, "purerl.adapters.playground_envs")
+    with pytest.raises(ValueError, match="need a network, once: Command .*clone.* 128"):
+        home.from_playground(home.PlaygroundOptions("Go1"))
 
 
 @pytest.mark.parametrize("name", ["from_brax", "from_playground", "gymnasium_env"])

@@ -2,6 +2,8 @@
 
 import copy
 import dataclasses
+import os
+import re
 import subprocess
 import sys
 import unittest
@@ -247,7 +249,9 @@ print(first.shape, first.std() > 10, abs(first - again).max(), abs(first - other
 @pytest.mark.usefixtures("opengl")
 def test_it_is_drawn():
     pytest.importorskip("gymnasium")
-    done = subprocess.run([sys.executable, "-c", DRAW], capture_output=True, text=True, cwd=ROOT)
+    words = [sys.executable, "-c", DRAW]
+    env = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
+    done = subprocess.run(words, capture_output=True, text=True, cwd=ROOT, env=env)
     assert done.stdout == "(480, 640, 3) True 0 True\n", done.stderr
 
 
@@ -293,7 +297,8 @@ def test_the_gaps_are_drawn_where_physics_has_them():
 
 # --- the page ---
 
-PYTHON = blocks(PAGES["docs/howto/adapters.md"].read_text(), "python")
+ADAPTERS = "docs/howto/adapters.md"
+PYTHON = blocks(PAGES[ADAPTERS].read_text(), "python")
 
 
 @pytest.mark.parametrize("library", ["gymnasium_env", "dm_env_environment"])
@@ -303,12 +308,16 @@ def test_the_page_runs(library):
     exec(block, {})
 
 
-@pytest.mark.parametrize(
-    ("library", "module"), [("brax", "brax"), ("playground", "mujoco_playground")]
-)
-def test_the_experiments_of_the_page_are_experiments(library, module):
+@pytest.mark.parametrize("module", ["brax", "mujoco_playground", "gymnasium"])
+def test_the_experiments_of_the_page_are_experiments(module):
     pytest.importorskip(module)
-    (block,) = [block for block in PYTHON if f"from_{library}" in block]
+    (block,) = [block for block in PYTHON if "from_brax" in block]
+    library = module.removeprefix("mujoco_")
+    rows = re.findall(r"^\| \w+ \| `(.*)` \| `(.*)` \|$", PAGES[ADAPTERS].read_text(), re.MULTILINE)
+    theirs = {build.partition("_")[2]: (build, env) for build, env in rows}
+    for brax, other in zip(theirs["brax"], theirs[library], strict=True):
+        assert brax in block
+        block = block.replace(brax, other)
     names: dict = {}
     exec(block, names)
     assert isinstance(names["experiment"], purerl.Experiment)

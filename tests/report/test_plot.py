@@ -42,6 +42,10 @@ def test_groups_have_marks_and_unfinished_runs_are_drawn(tmp_path, terminal, cap
     said = capsys.readouterr().out
     assert "*  ppo.learning_rate=0.001 (2 runs)" in said
     assert "o  ppo.learning_rate=1.0 (1 run)" in said and said.count("o") > 20
+    for kind, begins in ((".pdf", b"%PDF"), (".svg", b"<?xml")):
+        assert plot.main([str(tmp_path / "runs"), "--out", str(tmp_path / f"f{kind}")]) == 0
+        assert (tmp_path / f"f{kind}").read_bytes().startswith(begins)
+    assert b"/Type3" not in (tmp_path / "f.pdf").read_bytes()  # text stays text
     with Image.open(tmp_path / "f.png") as picture:
         colors = {tuple(c) for c in np.asarray(picture.convert("RGB")).reshape(-1, 3)}
     assert len(colors) > 20
@@ -70,7 +74,7 @@ def test_a_mistake_is_one_line(tmp_path, capsys):
         ([str(tmp_path / "nowhere")], "no run"),
         ([run, "--metric", "eval/episode_retrun"], "Did you mean 'eval/episode_return'?"),
         ([run, "--metric", "train/kl"], "no finite value"),
-        ([run, "--out", str(tmp_path / "f.bmp")], "end in .png"),
+        ([run, "--out", str(tmp_path / "f.bmp")], "end in .png, .pdf or .svg"),
         ([run, "--out", str(tmp_path / "no" / "f.png")], "cannot be written"),
     ]:
         assert plot.main(words) == USAGE, words

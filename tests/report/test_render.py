@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import purerl
 from purerl import render, run
-from purerl.core.errors import FAILURE, USAGE, RunError
+from purerl.core.errors import FAILURE, USAGE, RunError, UserError
 from purerl.core.keys import per_environment
 from purerl.envs import cartpole_swingup
-from purerl.physics.drawing import default_camera, root_body
+from purerl.physics.drawing import default_camera, find_camera, root_body
 from purerl.report import episode_pictures, opengl, renderer as drawing, video
 from purerl.runs.policy import Policy
 from purerl.runs.restored_run import restore
@@ -95,6 +96,20 @@ def test_what_is_not_the_default_stands_in_the_name(trained, capsys):
     said = capsys.readouterr().out
     assert "1.2 s (to its end)" in said
     assert re.search(r"evaluation after update 3: return .* in that range: [01] of 1", said)
+
+
+@pytest.mark.usefixtures("opengl")
+def test_frames_are_had_in_one_call_from_a_camera_by_name_or_number(trained):
+    loaded = purerl.load(trained)
+    model = loaded.env.physics.model
+    number = model.camera("front").id
+    images, rate = purerl.frames(loaded, number, seconds=0.2, size=(64, 48))
+    assert images.shape == (11, 48, 64, 3) and images.dtype == np.uint8 and rate == 50.0
+    assert np.abs(images[0].astype(int) - images[-1]).max() > 30  # the pole has moved
+    assert find_camera(model, "front") == find_camera(model, str(number)) == number
+    for wrong in ({"size": (0, 48)}, {"seconds": 0.0}, {"camera": model.ncam}, {"seed": -1}):
+        with pytest.raises(UserError, match=next(iter(wrong))):
+            purerl.frames(loaded, **wrong)
 
 
 def test_returns_are_held_against_the_evaluation_before_the_checkpoint():

@@ -82,9 +82,27 @@ def test_it_makes_the_same_run_as_the_command(tmp_path):
     assert "digest" in written(folders[0])["metrics"][-1]
 
 
+HEARD: list = []
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> purerl.Run:
-    return purerl.train(str(TOY), SETTINGS, runs=tmp_path_factory.mktemp("train"))
+    runs = tmp_path_factory.mktemp("train")
+    return purerl.train(str(TOY), SETTINGS, runs=runs, on_metrics=HEARD.append)
+
+
+def test_each_line_of_metrics_is_heard(trained):
+    lines = (trained.folder / "metrics.jsonl").read_text().splitlines()
+    written = [json.loads(line) for line in lines]
+    assert [{k: v for k, v in line.items() if k != "digest"} for line in written] == HEARD
+
+
+def test_an_error_of_who_hears_is_one_line_and_the_run_goes_on(trained, tmp_path):
+    with pytest.raises(purerl.UserError, match="on_metrics: KeyError: 'retrun' .*line") as told:
+        purerl.train(str(TOY), SETTINGS, runs=tmp_path, on_metrics=lambda line: line["retrun"])
+    assert __file__ in str(told.value)
+    run_ = purerl.train(str(TOY), SETTINGS, runs=tmp_path, resume=True)
+    assert run_.digest == trained.digest
 
 
 def test_it_returns_the_run(trained):
