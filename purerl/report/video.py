@@ -183,7 +183,7 @@ def _write_video(
     width, height = SHEET_WIDTH, round(SHEET_WIDTH * size[1] / size[0])
     sheet = Image.new("RGB", (SHEET * width, SHEET * height))
     writer = imageio_ffmpeg.write_frames(
-        str(path), size, fps=fps, codec="libx264", quality=7, macro_block_size=2,
+        str(path.absolute()), size, fps=fps, codec="libx264", quality=7, macro_block_size=2,
         ffmpeg_log_level="error",
     )  # fmt: skip
     writer.send(None)

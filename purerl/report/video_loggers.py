@@ -60,7 +60,7 @@ def as_gif(video: Path) -> tuple[bytes, tuple[int, int]]:
     """Returns a video as a GIF of the same duration, and its width and height [pixels]."""
     import imageio_ffmpeg
 
-    reader = imageio_ffmpeg.read_frames(str(video))
+    reader = imageio_ffmpeg.read_frames(str(video.absolute()))
     about = next(reader)
     width, height = about["size"]
     size = GIF_WIDTH, round(GIF_WIDTH * height / width)

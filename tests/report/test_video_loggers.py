@@ -3,6 +3,7 @@
 import io
 import json
 import struct
+from pathlib import Path
 
 import imageio_ffmpeg
 import numpy as np
@@ -11,6 +12,7 @@ from PIL import Image
 
 from purerl import run
 from purerl.experiment.options import RunOptions
+from purerl.report.video import _write_video
 from purerl.report.video_loggers import as_gif, log_video
 from tests.report.test_render import TINY
 
@@ -70,6 +72,14 @@ def test_a_gif_shows_the_video_in_its_own_time(video):
     assert seconds == pytest.approx(1.5)
     for frame, color in zip((shown[0], shown[len(shown) // 2], shown[-1]), COLORS, strict=True):
         assert np.abs(frame.mean((0, 1)) - color).max() < 60
+
+
+@pytest.mark.parametrize("name", ["a:b%03d.mp4", "http:x.mp4", "-y.mp4", "a[1].mp4"])
+def test_a_video_is_written_and_read_whatever_its_name(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    black = (np.zeros((*SIZE[::-1], 3), np.uint8) for _ in range(3))
+    _write_video(Path(name), black, 3, SIZE, 10.0)
+    assert [file.name for file in tmp_path.iterdir()] == [name] and as_gif(Path(name))
 
 
 def test_tensorboard_has_the_video_and_its_sheet(video):
