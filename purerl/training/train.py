@@ -131,12 +131,15 @@ def as_begun(source: Source, over: Over) -> tuple[Experiment, RunOptions]:
       source: the experiment.
       over: returns an experiment, and options by name, with what the command line has instead.
     """
-    from purerl.runs import folder, manifest
+    from purerl.runs import checkpoint_folder, folder, manifest
 
     known = chosen, options = over(source.experiment)
     if not options.resume or options.debug:
         return known
     place = next(iter(_folders(source, chosen, options)))
+    # Without a checkpoint nothing was trained: a mistake in the command may have ended it.
+    if not checkpoint_folder.updates(place / folder.CHECKPOINTS):
+        return known
     with contextlib.suppress(UserError):  # told where the folder is read as a run's
         if hash_code(read_bytes(place / folder.CODE)) == hash_code(source.text):
             begun = read_json(place / folder.CONFIG, settings=dict, schedule=dict)
