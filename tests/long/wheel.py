@@ -1,17 +1,20 @@
 """Is an installed purerl whole, alone and gone when it is uninstalled: wheel, sdist, for editing?
 
-python -m tests.long.wheel [--quick]
+python -m tests.long.wheel [--quick] [--extras brax,gymnasium]
 
 The sdist and the wheel are built from a copy of this clone. In an empty environment each of the
 three ways to install is tried: what it takes of Python's names, the commands in a folder whose
 `envs/`, `experiments/`, `assets/` and `tests/` raise when they are imported, a package of another
 project called `envs` installed before and after, and what is left when it is uninstalled. With the
 wheel cartpole_swingup trains to a return of 930; with --quick it trains as briefly as the others.
+Without --quick each extra is tried too, alone in an empty environment of its own; --extras tries
+those named and nothing else.
 It needs the package index, and no other network.
 """
 
 import argparse
 import email
+import email.message
 import json
 import os
 import re
@@ -21,17 +24,43 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
 LEFT_OUT = (".git", ".venv", "__pycache__", "*_cache", ".hypothesis", "build", "dist", "site")
+THEIRS = "from purerl import adapters, check_env; check_env(adapters.from_{}(adapters.{}))"
 DECOYS = ("envs", "experiments", "assets", "tests")  # names that many projects have
 OTHERS = (*DECOYS, "docs", "benchmarks", "peers")  # what a clone has, and nobody is to import
 FEW = "--ppo.num-steps 32768 --evaluation.number 1 --evaluation.num-episodes 4"
 FEW_OF_NEW = "--ppo.num-steps 8192 --evaluation.number 1 --evaluation.num-episodes 4"
 ENOUGH = 930.0  # return of 1000
+# What each extra is tried by: words after `purerl`, or Python.
+RUN = f"run cartpole_swingup --name a {FEW}"
+EXTRAS = {
+    "tensorboard": [f"{RUN} --tensorboard"],
+    "wandb": [f"{RUN} --wandb offline"],
+    "sweep": [
+        "import optuna, submitit",
+        f"sweep cartpole_swingup --optuna 1 --over ppo.gamma=0.95..0.999 --seeds 1 --name a {FEW}",
+    ],
+    "export": [
+        RUN,
+        "export runs/cartpole_swingup/a --format onnx --out p.onnx",
+        "export runs/cartpole_swingup/a --format jax --out p.jax",
+    ],
+    "view": ["import purerl.tune.view.page, purerl.tune.view.scene"],
+    "warp": ["import purerl; assert purerl.choose_engine('warp') == 'warp'"],
+    "brax": [THEIRS.format("brax", "BraxOptions('inverted_pendulum')")],
+    "playground": [THEIRS.format("playground", "PlaygroundOptions('CartpoleSwingup')")],
+    "gymnasium": [
+        THEIRS.format("gymnasium", "GymnasiumOptions('InvertedPendulum-v5')"),
+        "from purerl import adapters; from purerl.envs import cartpole_swingup; "
+        "adapters.gymnasium_env(cartpole_swingup.build()).reset(seed=0)",
+    ],
+}
+OF_DEVELOPERS = {"test", "peers", "docs"}
 BODIES = (
     "assets/cartpole.xml",
     *(f"experiment/templates/{x}" for x in ("body.xml", "train.sbatch")),
@@ -78,10 +107,14 @@ def main(arguments: list[str]) -> int:
     plain = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("tests.long.wheel", description=__doc__, formatter_class=plain)
     parser.add_argument("--quick", action="store_true", help="train briefly")
-    quick = parser.parse_args(arguments).quick
+    parser.add_argument("--extras", default="", help="try these extras alone, such as view,warp")
+    chosen = parser.parse_args(arguments)
+    extras = list(filter(None, chosen.extras.split(",")))
     with tempfile.TemporaryDirectory(prefix="purerl-wheel-") as folder:
         try:
-            for line in check(Place(Path(folder)), quick):
+            place = Place(Path(folder))
+            lines = check_extras(place, extras) if extras else check(place, chosen.quick)
+            for line in lines:
                 print(line, flush=True)
         except WrongError as failure:
             print(f"FAILED {failure}", flush=True)
@@ -104,6 +137,39 @@ def check(place: Place, quick: bool) -> Iterator[str]:
     for way, words in ways.items():
         for line in check_way(place, way, words, toy, whole=way == "wheel" and not quick):
             yield f"{way}: {line}"
+    need(declared(wheel) == set(EXTRAS), f"extras are {declared(wheel)}; {set(EXTRAS)} are tried")
+    for extra in [] if quick else EXTRAS:
+        yield check_extra(place, wheel, extra)
+
+
+def check_extras(place: Place, extras: Sequence[str]) -> Iterator[str]:
+    """Builds the wheel, and tries extras; yields a line for each."""
+    need(set(extras) <= set(EXTRAS), f"extras are {', '.join(EXTRAS)}")
+    shutil.copytree(ROOT, place.clone, symlinks=True, ignore=left_out)
+    wheel, _ = build(place)
+    for extra in extras:
+        yield check_extra(place, wheel, extra)
+
+
+def check_extra(place: Place, wheel: Path, extra: str) -> str:
+    """Installs the wheel with one extra in an empty environment, and uses what the extra is for."""
+    alone = Place(place.top / f"extra-{extra}")
+    alone.top.mkdir()
+    call(alone, alone.top, sys.executable, "-m", "venv", alone.top / "environment")
+    pip(alone, "install", "-c", place.clone / "constraints.txt", f"{wheel}[{extra}]")
+    here = alone.empty("work")
+    for words in EXTRAS[extra]:
+        if "import " in words:
+            call(alone, here, alone.python, "-c", words)
+        else:
+            purerl(alone, here, words)
+    shutil.rmtree(alone.top)
+    return f"extra {extra}: it is enough, alone in an empty environment"
+
+
+def declared(wheel: Path) -> set[str]:
+    """Returns the extras that a wheel declares for users."""
+    return set(metadata(wheel).get_all("Provides-Extra", [])) - OF_DEVELOPERS
 
 
 def check_way(place: Place, way: str, words: list, toy: Path, whole: bool) -> Iterator[str]:
@@ -160,10 +226,15 @@ def contents(wheel: Path) -> str:
 
 def requirements(wheel: Path) -> list[str]:
     """Returns what a wheel requires without any extra."""
+    found = metadata(wheel).get_all("Requires-Dist", [])
+    return [line for line in found if "extra ==" not in line]
+
+
+def metadata(wheel: Path) -> email.message.Message:
+    """Returns what a wheel says of itself."""
     archive = zipfile.ZipFile(wheel)
     (name,) = [name for name in archive.namelist() if name.endswith(".dist-info/METADATA")]
-    found = email.message_from_bytes(archive.read(name)).get_all("Requires-Dist", [])
-    return [line for line in found if "extra ==" not in line]
+    return email.message_from_bytes(archive.read(name))
 
 
 def make_toy(place: Place) -> Path:
