@@ -26,7 +26,9 @@ INFORMATIVE |= {"fingerprint", "had_checkpoint"}  # identity.py, folder.py
 INFORMATIVE |= {"experiment_file", "bit_exact", "inexact_because"}
 FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE")
 # Words in the names of JAX's options that move no bit; of all others the value is written down.
-HARMLESS = re.compile("cache|check[_s]|cross|debug|devices|dump|guard|log|platform|timeout|trace")
+HARMLESS = re.compile(
+    "cache|check[_s]|cross|debug|devices|dump|guard|log|platform|preemption|timeout|trace"
+)
 PORTABLE = "x86-64 with AVX2, portable"  # instead of a processor's model
 
 
