@@ -5,6 +5,7 @@ those made to the MJCF, then those made to the compiled model. They are the same
 only the solver's settings differ (`set_solver`).
 """
 
+import copy
 import dataclasses
 from collections.abc import Sequence
 
@@ -36,6 +37,7 @@ class Composed:
     end_effectors: tuple[int, ...]  # body ids
     joints: tuple[int, ...]  # ids of the walker's own joints, without the free one
     boxes: BoxFields  # the corridor's movable boxes; none on a floor
+    looks: mujoco.MjModel  # as it was compiled, before it was simplified: what eyes see
 
 
 def compose(
@@ -70,12 +72,13 @@ def compose(
     add_torso_velocity(walker, body)
     attach(root, walker, body, getattr(arena, "spawn_x", 0.0))
     model = mjcf.Physics.from_mjcf_model(root).model.ptr
+    looks = copy.copy(model)
     mask_contacts(model, body, self_collision)
     round_ellipsoids(model)
     free_boxes(model)
     set_solver(model, body, choose_engine(engine), timestep or body.timestep)
     check_contacts(model, body)
-    return _name_parts(model, body, arena)
+    return _name_parts(model, looks, body, arena)
 
 
 def find_part(walker: mjcf.RootElement, kind: str, name: str) -> mjcf.Element:
@@ -224,7 +227,7 @@ def check_contacts(model: mujoco.MjModel, body: Body) -> None:
             )
 
 
-def _name_parts(model: mujoco.MjModel, body: Body, arena: Arena) -> Composed:
+def _name_parts(model: mujoco.MjModel, looks: mujoco.MjModel, body: Body, arena: Arena) -> Composed:
     boxes = tuple(
         lookup.find(model, "geom", f"{GROUND}_{i}") for i in range(getattr(arena, "boxes", 0))
     )
@@ -237,4 +240,5 @@ def _name_parts(model: mujoco.MjModel, body: Body, arena: Arena) -> Composed:
         end_effectors=tuple(lookup.find(model, "body", PREFIX + n) for n in body.end_effectors),
         joints=tuple(i for i in range(model.njnt) if model.jnt_type[i] != free),
         boxes=box_fields(model, boxes),
+        looks=looks,
     )

@@ -11,7 +11,17 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
-from purerl import Array, Physics, PhysicsState, State, lookup, overflow_metric, overflow_reading
+from purerl import (
+    Array,
+    Physics,
+    PhysicsState,
+    State,
+    eyes as seeing,
+    lookup,
+    overflow_metric,
+    overflow_reading,
+)
+from purerl.envs import sight
 from purerl.envs.arenas import (
     Arena,
     Floor,
@@ -24,7 +34,7 @@ from purerl.envs.arenas import (
     platform_boxes,
 )
 from purerl.envs.bodies import ANT, RODENT, Body
-from purerl.envs.compose import Composed, compose
+from purerl.envs.compose import PREFIX, Composed, compose
 
 BODIES = {"ant": ANT, "rodent": RODENT}
 READINGS = ("xpos", "xmat", "subtree_com", "actuator_force")
@@ -94,6 +104,8 @@ class Options:
     """Whether x and y of the torso can be felt (y always is in a corridor)."""
     observe_bodies: bool = False
     """Whether inertia and velocity of every body (`cinert`, `cvel`) can be felt."""
+    eyes: sight.Sight = sight.Sight()
+    """With eyes it is not told of edges; the observation is a dict, and the value function is."""
     randomization: Randomization = Randomization()
     """What differs between episodes beside the corridor."""
 
@@ -108,6 +120,7 @@ class Run:
     joints: tuple[int, ...]  # of qpos
     dofs: tuple[int, ...]  # of qvel
     action_size: int
+    eyes: seeing.Eyes | None
 
     @property
     def control_timestep(self) -> float:
@@ -130,6 +143,9 @@ class Run:
         if isinstance(self.parts.arena, GapsCorridor):
             task["course"] = draw_course(course_key, self.parts.arena)
             task["crossed"] = jnp.zeros((), jnp.int32)
+        if self.eyes:
+            # Not of the keys above: a body without eyes draws what it always drew.
+            task["eyes"] = sight.draw(jax.random.fold_in(key, 1), self.options.eyes)
         physics, readings = self.physics.init(qpos, qvel, self._changes(task, qpos[0]))
         center = readings.subtree_com[self.parts.torso, 0]
         return self._state(physics, readings, task, center, jnp.zeros(self.action_size))
@@ -195,8 +211,12 @@ class Run:
             task=task,
         )
 
-    def _observe(self, physics: PhysicsState, readings: Any, task: dict, action: Array) -> Array:
-        """Returns [O]: posture and motion in the torso's own frame, forces, and what lies ahead."""
+    def _observe(self, physics: PhysicsState, readings: Any, task: dict, action: Array) -> Any:
+        """Returns [O]: posture and motion in the torso's own frame, forces, and what lies ahead.
+
+        With eyes: a dict of `policy` [O], `eyes` [E, H, W] uint8 and, in a corridor, `privileged`,
+        which is what lies ahead.
+        """
         torso = self.parts.torso
         to_body = readings.xmat[torso].T
         ends = readings.xpos[jnp.array(self.parts.end_effectors)] - readings.xpos[torso]
@@ -216,11 +236,23 @@ class Run:
             parts.append(physics.qpos[:2])
         if self.options.observe_bodies:
             parts += [readings.cinert[1:].ravel(), readings.cvel[1:].ravel()]
+        told = []
         if isinstance(self.parts.arena, GapsCorridor):
-            sight = self.parts.body.sight
-            edges = distances_to_next_edges(task["course"], physics.qpos[0], 6, sight)
-            parts += [physics.qpos[1:2], edges]
-        return jnp.concatenate(parts)
+            farthest = self.parts.body.sight
+            edges = distances_to_next_edges(task["course"], physics.qpos[0], 6, farthest)
+            told = [physics.qpos[1:2], edges]
+        if not self.eyes:
+            return jnp.concatenate(parts + told)
+        seen = {"policy": jnp.concatenate(parts), "eyes": self._pictures(physics, readings, task)}
+        return seen | ({"privileged": jnp.concatenate(told)} if told else {})
+
+    def _pictures(self, physics: PhysicsState, readings: Any, task: dict) -> Array:
+        """Returns what the eyes bring on, [E, H, W] uint8: this episode's whole course too."""
+        boxes = None
+        if "course" in task:
+            boxes = platform_boxes(task["course"], self.options.corridor_width)
+        sharp = self.eyes.see(readings.xpos, readings.xmat, boxes)
+        return sight.spoil(sharp, task["eyes"], physics.time, self.options.eyes)
 
 
 def is_healthy(body: Body, options: Options, height: Array, up: Array, turn: Array) -> Array:
@@ -306,6 +338,8 @@ def build(options: Options = Options(), engine: str = "auto") -> Run:  # noqa: B
     joints = [lookup.names(model, "joint")[i] for i in parts.joints]
     readings = READINGS + (BODY_READINGS if options.observe_bodies else ())
     readings += overflow_reading(engine)
+    window = tuple(lookup.names(model, "geom")[i] for i in parts.boxes.boxes)
+    eye = seeing.of_camera(parts.looks, PREFIX + body.camera)
     return Run(
         options=options,
         physics=Physics(model, readings, options.substeps, engine),
@@ -313,4 +347,5 @@ def build(options: Options = Options(), engine: str = "auto") -> Run:  # noqa: B
         joints=tuple(lookup.qpos_indices(model, joints).tolist()),
         dofs=tuple(lookup.qvel_indices(model, joints).tolist()),
         action_size=model.nu,
+        eyes=sight.build(parts.looks, eye, body.eye_distance, options.eyes, window),
     )

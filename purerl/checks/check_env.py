@@ -167,10 +167,10 @@ def check_fields(state: Any) -> None:
                 f"observation{jax.tree_util.keystr(path)} is inside another dict: an observation "
                 "is one array, or a dict of arrays. Name its parts 'arm/angle', say."
             )
-        if leaf.dtype != jnp.float32 or leaf.ndim == 0:
+        if leaf.dtype not in (jnp.float32, jnp.uint8) or leaf.ndim == 0:
             raise EnvError(
-                f"observation{jax.tree_util.keystr(path)} is {_describe(leaf)}: its "
-                "arrays must be float32 with at least one axis."
+                f"observation{jax.tree_util.keystr(path)} is {_describe(leaf)}: its arrays must be "
+                "float32, or uint8 if they are pictures, with at least one axis."
             )
 
 

@@ -25,7 +25,9 @@ class State(struct.PyTreeNode):
     """
 
     physics: PyTree  # all the physics needs to go on, and no more (PhysicsState)
-    observation: PyTree  # float32 leaves: an array [O], or {"policy": [O], "privileged": [P]}
+    observation: (
+        PyTree  # float32, pictures uint8: an array [O], or {"policy": [O], "privileged": [P]}
+    )
     reward: Array  # [] float32
     terminated: Array  # [] bool: the task ended; nothing comes after
     truncated: Array  # [] bool: stopped for a reason outside the task; bootstrap from here

@@ -13,7 +13,7 @@ samples an increment is smaller than the last bit of the mean. The count is an e
 batch, and lives for one update.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -53,22 +53,31 @@ def init(example: PyTree) -> Statistics:
     """Returns statistics of nothing (mean 0, variance 1) for features shaped like `example` [O]."""
 
     def full(value: float) -> PyTree:
-        fill = jnp.full_like
-        return jax.tree.map(lambda x: Compensated(fill(x, value), jnp.zeros_like(x)), example)
+        def one(x: Array) -> Compensated:
+            return Compensated(jnp.full_like(x, value), jnp.zeros_like(x))
+
+        return jax.tree.map(one, _measured(example))
 
     # With count 0 the first batch has the share 1: it replaces these numbers, and mixes with none.
     return Statistics(count=zero_count(), mean=full(0.0), variance=full(1.0))
 
 
+def _measured(features: PyTree) -> PyTree:
+    """Returns features without pictures (uint8), which have no statistics: their scale is known."""
+    return jax.tree.map(lambda x: None if x.dtype == jnp.uint8 else x, features)
+
+
 def normalize(statistics: Statistics, features: PyTree) -> PyTree:
-    """Returns (features - mean) / std, clipped to +-10, leaves [..., O].
+    """Returns (features - mean) / std, clipped to +-10; of pictures -1 to 1. Leaves [..., O].
 
     Args:
       statistics: of the features, leaves [O], unbatched.
       features: leaves [..., O], any leading batch axes.
     """
 
-    def one(x: Array, mean: Compensated, variance: Compensated) -> Array:
+    def one(x: Array, mean: Compensated | None, variance: Any) -> Array:
+        if mean is None:
+            return x.astype(jnp.float32) / 127.5 - 1.0
         # The factor is computed at size [O], before it meets the batch.
         factor = jax.lax.rsqrt(variance.value + VARIANCE_FLOOR)
         scaled = (x - _like(mean.value, x)) * _like(factor, x)
@@ -90,6 +99,7 @@ def deviations(statistics: Statistics, batch: PyTree, valid: Array) -> Moments:
       batch: leaves [..., O].
       valid: [...] bool: which samples count.
     """
+    batch = _measured(batch)
     reference = jax.tree.map(lambda x, mean: mean.value, batch, statistics.mean)
     return moments_of(batch, valid, reference)
 

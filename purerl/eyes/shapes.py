@@ -1,0 +1,120 @@
+"""Where a ray enters a shape, and how the surface lies there.
+
+Every shape is scaled to a unit one in its own frame, so that few numbers describe it. A ray is
+`origin + t * direction`; `t` is infinite where it misses, or begins inside. Only entries count, as
+in MuJoCo's renderer, which draws no surface from behind: an eye inside a skull looks through it.
+
+The letters: o [3] the origin, d three arrays [...] the directions, in the scaled frame.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from purerl.core.records import Array
+
+_GEOM = mujoco.mjtGeom
+
+
+class Kind(NamedTuple):
+    """A kind of shape."""
+
+    scale: Callable[[np.ndarray], np.ndarray]  # geom_size [3] -> [3] to divide by [m]
+    enter: Callable[[Array, Sequence[Array], Array], Array]  # o, d, length [] -> t [...]
+    normal: Callable[[Array, Array], Array]  # point [..., 3], length [...] -> [..., 3], any length
+
+
+def _dot(x: Sequence[Array], y: Sequence[Array]) -> Array:
+    return sum((p * q for p, q in zip(x[1:], y[1:], strict=True)), x[0] * y[0])
+
+
+def _round(o: Sequence[Array], d: Sequence[Array]) -> tuple[Array, Array]:
+    """Returns t of the entry into what is round in the coordinates given, and whether it is one.
+
+    From the point nearest to the middle: b^2 - a c would cancel for a toe seen from afar.
+    """
+    inverse = 1.0 / jnp.maximum(_dot(d, d), 1e-20)
+    nearest = -_dot(o, d) * inverse
+    off = [p + nearest * x for p, x in zip(o, d, strict=True)]
+    inside = 1.0 - _dot(off, off)
+    return nearest - jnp.sqrt(jnp.maximum(inside, 0.0) * inverse), inside > 0.0
+
+
+def _ahead(t: Array, hit: Array) -> Array:
+    return jnp.where(hit & (t > 0.0), t, jnp.inf)
+
+
+def _enter_ball(o: Array, d: Sequence[Array], length: Array) -> Array:
+    return _ahead(*_round(o, d))
+
+
+def _enter_capsule(o: Array, d: Sequence[Array], length: Array) -> Array:
+    t, hit = _round(o[:2], d[:2])
+    z = o[2] + t * d[2]
+    at_end, hit_end = _round([o[0], o[1], o[2] - jnp.where(z > 0.0, length, -length)], d)
+    side = jnp.abs(z) <= length
+    return _ahead(jnp.where(side, t, at_end), hit & (side | hit_end))
+
+
+def _enter_cylinder(o: Array, d: Sequence[Array], length: Array) -> Array:
+    t = (jnp.sign(o[2]) * length - o[2]) / d[2]  # the lid on this side
+    x, y = o[0] + t * d[0], o[1] + t * d[1]
+    lid = _ahead(t, (jnp.abs(o[2]) > length) & (x * x + y * y <= 1.0))
+    t, hit = _round(o[:2], d[:2])
+    side = hit & (jnp.abs(o[2] + t * d[2]) <= length)
+    return jnp.minimum(_ahead(t, side), lid)
+
+
+def _enter_box(o: Array, d: Sequence[Array], length: Array) -> Array:
+    inverse = [1.0 / x for x in d]
+    low = [(-1.0 - p) * i for p, i in zip(o, inverse, strict=True)]
+    high = [(1.0 - p) * i for p, i in zip(o, inverse, strict=True)]
+    near, far = map(jnp.minimum, low, high), map(jnp.maximum, low, high)
+    enters, leaves = _fold(jnp.maximum, near), _fold(jnp.minimum, far)
+    return _ahead(enters, enters <= leaves)
+
+
+def _fold(function: Callable[[Array, Array], Array], three: Sequence[Array]) -> Array:
+    x, y, z = three
+    return function(function(x, y), z)
+
+
+def _enter_plane(o: Array, d: Sequence[Array], length: Array) -> Array:
+    return _ahead(-o[2] / d[2], (o[2] > 0.0) & (d[2] < 0.0))
+
+
+def _normal_of_ball(p: Array, length: Array) -> Array:
+    return p
+
+
+def _normal_of_capsule(p: Array, length: Array) -> Array:
+    return p.at[..., 2].add(-jnp.clip(p[..., 2], -length, length))
+
+
+def _normal_of_cylinder(p: Array, length: Array) -> Array:
+    on_lid = jnp.abs(p[..., 2]) > length * (1.0 - 1e-4)
+    axis = jnp.array([0.0, 0.0, 1.0])
+    return jnp.where(on_lid[..., None], jnp.sign(p) * axis, p * (1.0 - axis))
+
+
+def _normal_of_box(p: Array, length: Array) -> Array:
+    size = jnp.abs(p)
+    return jnp.where(size == size.max(-1, keepdims=True), p, 0.0)
+
+
+def _normal_of_plane(p: Array, length: Array) -> Array:
+    return jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), p.shape)
+
+
+# In this order shapes stand in a scene. Boxes are last: those of an episode follow the model's.
+KINDS = {
+    _GEOM.mjGEOM_PLANE: Kind(np.ones_like, _enter_plane, _normal_of_plane),
+    _GEOM.mjGEOM_SPHERE: Kind(lambda s: s[[0, 0, 0]], _enter_ball, _normal_of_ball),
+    _GEOM.mjGEOM_ELLIPSOID: Kind(lambda s: s, _enter_ball, _normal_of_ball),
+    _GEOM.mjGEOM_CAPSULE: Kind(lambda s: s[[0, 0, 0]], _enter_capsule, _normal_of_capsule),
+    _GEOM.mjGEOM_CYLINDER: Kind(lambda s: s[[0, 0, 0]], _enter_cylinder, _normal_of_cylinder),
+    _GEOM.mjGEOM_BOX: Kind(lambda s: s, _enter_box, _normal_of_box),
+}
