@@ -1,0 +1,232 @@
+"""What eyes see is what stands there: against MuJoCo's own rays, kind by kind."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from purerl import eyes
+from purerl.eyes.eye import axes_of
+from purerl.eyes.scene import ABYSS, CONTRAST, SHADE, SKY
+
+KINDS = {
+    "plane": '<geom type="plane" size="0 0 1" pos="0 0 -.4" euler="5 3 0"/>',
+    "sphere": '<geom type="sphere" size=".3" pos=".1 .1 0"/>',
+    "ellipsoid": '<geom type="ellipsoid" size=".1 .3 .2" euler="20 30 40"/>',
+    "capsule": '<geom type="capsule" size=".15 .3" euler="20 60 40"/>',
+    "cylinder": '<geom type="cylinder" size=".25 .2" euler="20 60 40"/>',
+    "box": '<geom type="box" size=".3 .1 .2" euler="20 30 40"/>',
+}
+EYE = eyes.Eye("head", fovy=60.0)
+
+
+def model_of(*geoms: str, head: str = "") -> mujoco.MjModel:
+    """Geoms around the origin, and a head without weight of its own that can be anywhere."""
+    return mujoco.MjModel.from_xml_string(
+        '<mujoco><compiler angle="degree"/><worldbody>'
+        '<body mocap="true"><geom type="sphere" size="1e-3" rgba="0 0 0 0"/>'
+        f"{''.join(geoms)}</body>"
+        f'<body name="head" mocap="true">{head}'
+        '<camera name="own" pos="0 0 .1" xyaxes="0 -1 0 0 0 1" fovy="70"/>'
+        '<camera name="after" mode="track"/></body>'
+        "</worldbody></mujoco>"
+    )
+
+
+def places(model: mujoco.MjModel, position, toward, turn: float = 0.0):
+    """MuJoCo's data, and xpos and xmat, for a head that looks from one point toward another."""
+    data = mujoco.MjData(model)
+    x = np.subtract(toward, position) / np.linalg.norm(np.subtract(toward, position))
+    y = np.cross([0.0, np.sin(turn), np.cos(turn)], x)
+    y /= np.linalg.norm(y)
+    axes = np.stack([x, y, np.cross(x, y)], axis=1)
+    data.mocap_pos[1] = position
+    mujoco.mju_mat2Quat(data.mocap_quat[1], axes.ravel())
+    mujoco.mj_forward(model, data)
+    return data, jnp.float32(data.xpos), jnp.float32(data.xmat.reshape(-1, 3, 3))
+
+
+def distance(sight: eyes.Eyes, *places) -> np.ndarray:
+    return np.asarray(jax.jit(sight.distance)(*places))
+
+
+def picture(sight: eyes.Eyes, *places) -> np.ndarray:
+    return np.asarray(jax.jit(sight.see)(*places))
+
+
+def rays_of_mujoco(model, data, eye: eyes.Eye, size: int) -> np.ndarray:
+    """Distances [size, size] along rays, by `mj_ray`; inf where it meets nothing."""
+    axes = data.body(eye.body).xmat.reshape(3, 3) @ axes_of(eye)
+    start = data.body(eye.body).xpos + data.body(eye.body).xmat.reshape(3, 3) @ eye.position
+    half, found = np.tan(np.radians(eye.fovy / 2)), np.zeros((size, size))
+    for row, column in np.ndindex(size, size):
+        right, up = (2 * column + 1) / size - 1, 1 - (2 * row + 1) / size
+        ray = axes @ [half * right, half * up, -1.0]
+        groups, geom = np.array([1, 1, 1, 0, 0, 0], np.uint8), np.zeros(1, np.int32)
+        ray /= np.linalg.norm(ray)
+        found[row, column] = mujoco.mj_ray(model, data, start, ray, groups, 1, -1, geom)
+    return np.where(found < 0, np.inf, found)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_kind_is_where_mujocos_rays_meet_it(kind):
+    """1 s each. From eight sides, askew; four from afar, where b^2 - a c would cancel."""
+    model, random, hits = model_of(KINDS[kind]), np.random.default_rng(0), 0
+    for far, fovy in ((1.0, 60.0), (100.0, 0.6)):
+        eye = dataclasses.replace(EYE, fovy=fovy)
+        distances = jax.jit(eyes.Eyes(model, [eye], (15, 15), reach=1e3).distance)
+        for side in random.normal(size=(4, 3)):
+            side[2] = abs(side[2])
+            place, toward = far * side / np.linalg.norm(side), 0.1 * random.normal(size=3)
+            data, xpos, xmat = places(model, place, toward, random.uniform(0, 1))
+            found, right = distances(xpos, xmat)[0], rays_of_mujoco(model, data, eye, 15)
+            both = np.isfinite(found) & np.isfinite(right)
+            np.testing.assert_allclose(found[both], right[both], rtol=1e-4 if far < 10 else 3e-6)
+            # On an outline rounding decides.
+            assert (np.isfinite(found) != np.isfinite(right)).sum() <= 2
+            hits += both.sum()
+    assert hits > 150
+
+
+def test_all_together_the_nearest_is_seen_and_what_is_behind_costs_nothing():
+    """2 s. Shapes behind the eye, beside its view or out of reach change no bit."""
+    shifts = {"ellipsoid": "0 .5 0", "box": ".5 0 .2", "capsule": "-.4 .2 .1"}
+    moved = [
+        g.replace("/>", f' pos="{shifts[k]}"/>' if k in shifts else "/>") for k, g in KINDS.items()
+    ]
+    model = model_of(*moved)
+    sight = eyes.Eyes(model, [EYE], (24, 24), reach=5.0)
+    data, xpos, xmat = places(model, [1.2, 0.3, 0.5], [0, 0, 0])
+    found, right = distance(sight, xpos, xmat)[0], rays_of_mujoco(model, data, EYE, 24)
+    both = np.isfinite(found) & np.isfinite(right)
+    assert both.mean() > 0.5
+    np.testing.assert_allclose(found[both], right[both], rtol=1e-4)
+    away = (
+        '<geom type="box" size=".2 .2 .2" pos="3 .5 1"/>',
+        '<geom type="sphere" size=".1" pos="0 9 0"/>',
+        '<geom type="capsule" size=".1 .1" pos="-6 -1 -2"/>',
+    )
+    more = eyes.Eyes(model_of(*moved, *away), [EYE], (24, 24), reach=5.0)
+    assert np.array_equal(picture(sight, xpos, xmat), picture(more, xpos, xmat))
+
+
+def test_boxes_of_an_episode_are_seen_like_those_of_the_model():
+    """1 s. To the bit where they are as grey."""
+    still = '<geom type="box" size=".3 .1 .2" pos="0 .1 0" rgba=".5 .5 .5 1"/>'
+    compiled = model_of(still).__copy__()
+    compiled.body_mocapid[1] = -1
+    sight = eyes.Eyes(compiled, [EYE], hide=())
+    _, xpos, xmat = places(model_of(still), [1.0, 0.3, 0.5], [0, 0, 0])
+    bare = eyes.Eyes(model_of(), [EYE])
+    boxes = jnp.array([[0.0, 0.1, 0.0], [0.0, 9.0, 0.0]]), jnp.array([[0.3, 0.1, 0.2], [1.0, 1, 1]])
+    found = distance(bare, xpos, xmat, boxes)
+    assert np.array_equal(distance(sight, xpos, xmat), found) and np.isfinite(found).any()
+
+
+def test_upright_and_right_way_round():
+    """A picture's upper row is the sky, and a left eye sees more of what is on the left."""
+    ball = '<geom type="sphere" size=".1" pos="0 .5 0" rgba="1 1 1 1"/>'
+    model = model_of(ball)
+    _, xpos, xmat = places(model, [-1.0, 0.0, 0.0], [0, 0, 0])
+    seen = np.isfinite(distance(eyes.Eyes(model, [EYE], (9, 9)), xpos, xmat))[0]
+    assert seen[:, :4].any() and not seen[:, 4:].any()  # it is on the left
+    left, right = np.isfinite(
+        eyes.Eyes(model, eyes.pair(EYE, 0.1, 0.0), (9, 9)).distance(xpos, xmat)
+    )
+    assert left[:, 4:].any() and not right.any()
+    greys = picture(eyes.Eyes(model, [EYE], (9, 9)), xpos, xmat)[0]
+    assert greys[0, 8] == round(255 * SKY) and greys[8, 8] == round(255 * ABYSS)
+
+
+def test_light_falls_from_above_and_the_ground_has_checks():
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><geom type="plane" size="0 0 1" rgba=".5 .5 .5 1"/>'
+        '<body name="head" pos="0 0 .5"><geom type="sphere" size=".1" rgba=".5 .5 .5 1"/></body>'
+        "</worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    down = eyes.Eye("world", (0.3, 0.0, 1.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), 40.0)
+    up = dataclasses.replace(down, position=(0.3, 0.0, 0.01), direction=(-0.3, 0.0, 0.49))
+    xpos, xmat = jnp.float32(data.xpos), jnp.float32(data.xmat.reshape(-1, 3, 3))
+    ground = picture(eyes.Eyes(model, [down], hide=["head"], check=0.2), xpos, xmat)
+    greys, counts = np.unique(ground, return_counts=True)
+    assert len(greys) == 2 and counts.min() > 0.3 * ground.size  # flat, so lit alike: two greys
+    low, high = map(float, greys)
+    assert abs((high - low) / (high + low) - CONTRAST) < 0.02
+    ball = picture(eyes.Eyes(model, [up]), xpos, xmat)[0, 16, 16]
+    assert ball == round(255 * 0.5 * SHADE)  # from below, where no light falls
+
+
+def test_checks_that_are_too_small_fade():
+    """The ground near the horizon is its mean grey: it would flicker otherwise."""
+    model = model_of('<geom type="plane" size="0 0 1" rgba=".5 .5 .5 1"/>')
+    model.body_mocapid[1] = -1
+    model.geom_bodyid[:] = 0
+    _, xpos, xmat = places(model, [0.0, 0, 0.3], [10.0, 0, 0.3])
+    seen = picture(eyes.Eyes(model, [EYE], (64, 64), reach=1e3), xpos, xmat)[0].astype(float)
+    assert seen[34:37].std(axis=1).max() < 3 < 40 < seen[60:].std(axis=1).min()
+
+
+def test_what_is_hidden_clear_or_far_is_not_seen():
+    ball = '<geom name="ball" type="sphere" size=".1" {}/>'
+    _, xpos, xmat = places(model_of(ball.format("")), [-1.0, 0.0, 0.0], [0, 0, 0])
+
+    def seen(extra: str, **words) -> bool:
+        sight = eyes.Eyes(model_of(ball.format(extra)), [EYE], (9, 9), **words)
+        return bool(np.isfinite(distance(sight, xpos, xmat)).any())
+
+    assert seen("")
+    assert not seen("", hide=["ball"]) and not seen("", reach=0.8)
+    assert not seen('rgba="1 1 1 0"') and not seen('group="3"')
+
+
+def test_an_eye_looks_through_what_it_is_in():
+    """As MuJoCo's renderer, which draws no surface from behind: dm_control's rat needs it."""
+    model = model_of(KINDS["sphere"], head='<geom type="ellipsoid" size=".2 .1 .1"/>')
+    data, xpos, xmat = places(model, [-1.0, 0.1, 0.0], [0.1, 0.1, 0])
+    bare = model_of(KINDS["sphere"])
+    one, other = (distance(eyes.Eyes(m, [EYE], (9, 9)), xpos, xmat) for m in (model, bare))
+    assert np.array_equal(one, other) and np.isfinite(one).any()
+
+
+def test_a_camera_of_the_model_is_an_eye():
+    own = eyes.of_camera(model_of(), "own")
+    assert own.body == "head" and own.fovy == 70.0
+    np.testing.assert_allclose([own.position, own.direction, own.up],
+                               [[0, 0, 0.1], [1, 0, 0], [0, 0, 1]], atol=1e-9)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: eyes.Eye("head", fovy=180.0), "fovy is 180.0; give degrees, more than 0 and less"),
+        (lambda: eyes.Eye("head", up=(2.0, 0, 0)), "are parallel or 0"),
+        (
+            lambda: eyes.pair(EYE, 0.1, 61.0),
+            "overlap is 61.0; give degrees, 0 to the eye's fovy, 60",
+        ),
+        (lambda: eyes.of_camera(model_of(), "owm"), "There is no camera 'owm'. Did you mean 'own'"),
+        (lambda: eyes.of_camera(model_of(), "after"), "Camera 'after' follows a body"),
+        (lambda: eyes.Eyes(model_of(), [eyes.Eye("had")]), "There is no body 'had'"),
+        (lambda: eyes.Eyes(model_of(), [EYE], hide=["x"]), "body or geom in hide"),
+        (lambda: eyes.Eyes(model_of(), [EYE], (0, 3)), "all are above 0"),
+        (lambda: eyes.Eyes(model_of(), []), "give at least one eye"),
+        (lambda: eyes.Eyes(mesh(), [EYE]), "do not see a mesh, and geom 'stone' is one"),
+    ],
+)
+def test_mistakes_are_a_line(make, message):
+    with pytest.raises(ValueError, match=message) as error:
+        make()
+    assert "\n" not in str(error.value)
+
+
+def mesh() -> mujoco.MjModel:
+    """A model with a mesh."""
+    return mujoco.MjModel.from_xml_string(
+        '<mujoco><asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset><worldbody>'
+        '<geom name="stone" type="mesh" mesh="m"/><body name="head"/></worldbody></mujoco>'
+    )

@@ -1,0 +1,166 @@
+"""Networks that see, and environments with eyes."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from purerl import eyes
+from purerl.envs import run, sight
+from purerl.eyes.networks import windows
+from purerl.ppo import running_moments
+
+LAB = eyes.Encoder(channels=(4, 8), kernels=(3, 3), strides=(1, 2), features=6)
+SEEN = {"policy": jnp.ones(3), "eyes": jnp.zeros((2, 12, 12), jnp.uint8), "privileged": jnp.ones(2)}
+NORMAL = SEEN | {"eyes": jnp.zeros((2, 12, 12))}
+
+
+@pytest.mark.parametrize(("kernel", "stride"), [(3, 1), (3, 2), (4, 4), (5, 3)])
+def test_windows_times_weights_are_a_convolution(kernel, stride):
+    x = jax.random.normal(jax.random.key(0), (2, 13, 14, 3))
+    weights = jax.random.normal(jax.random.key(1), (kernel, kernel, 3, 5))
+    right = jax.lax.conv_general_dilated(
+        x, weights, (stride, stride), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
+    )
+    found = windows(x, kernel, stride) @ weights.reshape(-1, 5)
+    np.testing.assert_allclose(found, right, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_both_eyes_reach_the_policy(shared):
+    options = eyes.MlpOptions(eyes=dataclasses.replace(LAB, shared=shared))
+    network = eyes.mlp(options, SEEN, 2)
+    params, memory = jax.jit(network.init)(jax.random.key(0))
+    assert memory == ()
+    own = params["params"]
+    assert {"eyes"} <= own.keys() if shared else {"eye0", "eye1"} <= own.keys()
+
+    def policy(pictures):
+        return network.apply(params, NORMAL | {"eyes": pictures}, ())[0].distribution.loc.sum()
+
+    moved = jax.jit(jax.grad(policy))(jax.random.normal(jax.random.key(1), (2, 12, 12)))
+    assert (np.abs(moved).max(axis=(1, 2)) > 0).all()
+    batched = jax.tree.map(lambda x: jnp.broadcast_to(x, (4, 5, *x.shape)), NORMAL)
+    assert jax.jit(network.apply)(params, batched, ())[0].value.shape == (4, 5)
+
+
+def test_a_memory_stands_behind_the_eyes():
+    network = eyes.recurrent(eyes.RecurrentOptions(cell="lstm", hidden=7, eyes=LAB), SEEN, 2)
+    params, memory = jax.jit(network.init)(jax.random.key(0))
+    output, following = jax.jit(network.apply)(params, NORMAL, memory)
+    assert output.distribution.loc.shape == (2,) and following[0].shape == (7,)
+
+
+def test_what_is_privileged_moves_the_value_alone():
+    network = eyes.mlp(eyes.MlpOptions(eyes=LAB), SEEN, 2)
+    params, _ = jax.jit(network.init)(jax.random.key(0))
+    one, other = (
+        network.apply(params, NORMAL | {"privileged": x * jnp.ones(2)}, ())[0] for x in (0, 1)
+    )
+    assert np.array_equal(one.distribution.loc, other.distribution.loc) and one.value != other.value
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: eyes.Encoder(channels=(4, 8)), "are of different lengths"),
+        (lambda: eyes.Encoder(strides=(2, 0, 2)), "has a number below 1"),
+        (lambda: eyes.mlp(eyes.MlpOptions(), jnp.zeros(4), 2), "needs a dict with pictures"),
+        (
+            lambda: eyes.mlp(
+                eyes.MlpOptions(eyes=LAB), SEEN | {"eyes": jnp.zeros((1, 3, 3))}, 2
+            ).init(jax.random.key(0)),
+            "A kernel of 3 looks at a picture of 1 x 1 pixels",
+        ),
+        (lambda: sight.Sight(number=1, dropout=0.5), "closed and dropout are of two eyes"),
+        (lambda: sight.Sight(number=2, dropout=1.5), "dropout is 1.5"),
+    ],
+)
+def test_mistakes_are_a_line(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_pictures_have_no_statistics_and_are_normalized_by_their_range():
+    statistics = running_moments.init(SEEN)
+    assert jax.tree.leaves(statistics.mean["eyes"]) == []
+    batch = jax.tree.map(lambda x: jnp.stack([x, 2 * x]), SEEN)
+    seen = running_moments.deviations(statistics, batch, jnp.ones(2, bool))
+    merged = running_moments.merge(statistics, seen)
+    white = SEEN | {"eyes": jnp.full((2, 12, 12), 255, jnp.uint8)}
+    assert (running_moments.normalize(merged, white)["eyes"] == 1.0).all()
+    assert (running_moments.normalize(merged, SEEN)["eyes"] == -1.0).all()
+    np.testing.assert_allclose(running_moments.normalize(merged, SEEN)["policy"], -1.0, rtol=1e-5)
+
+
+# --- the corridor ---
+
+
+@pytest.fixture(scope="module")
+def ant():
+    """15 s: the ant in a corridor, with two eyes, one of which may be closed."""
+    options = sight.Sight(
+        number=2, size=16, reach=8.0, check=0.5, dropout=0.5, noise=0.02, blur=0.5
+    )
+    env = run.build(run.Options(arena="gaps", eyes=options), "c")
+    return env, jax.jit(env.reset), jax.jit(env.step)
+
+
+def test_the_actor_is_not_told_of_edges(ant):
+    env, reset, _ = ant
+    told = jax.jit(run.build(run.Options(arena="gaps"), "c").reset)
+    seen, known = reset(jax.random.key(0)).observation, told(jax.random.key(0)).observation
+    assert seen["eyes"].shape == (2, 16, 16) and seen["eyes"].dtype == jnp.uint8
+    # Else it is the same environment: the same start, and what is missing is the critic's.
+    assert np.array_equal(np.concatenate([seen["policy"], seen["privileged"]]), known)
+
+
+def test_a_gap_ahead_is_seen_and_each_episode_has_its_own(ant):
+    env, reset, _ = ant
+
+    @jax.jit
+    def sees(state):
+        return env.eyes.see(*places(env, state))
+
+    sharp = [sees(reset(jax.random.key(k))) for k in (0, 0, 1)]
+    sharp = list(map(np.asarray, sharp))
+    assert np.array_equal(sharp[0], sharp[1]) and not np.array_equal(sharp[0], sharp[2])
+    assert (sharp[0] == 0).any()  # the abyss
+
+
+def places(env, state):
+    """What the eyes of a state are given."""
+    readings = env.physics.init(state.physics.qpos, state.physics.qvel, env.model_changes(state))[1]
+    return readings.xpos, readings.xmat, env.scenery(state)
+
+
+def test_an_eye_is_closed_for_a_whole_episode(ant):
+    _, reset, step = ant
+    closed = []
+    for key in jax.random.split(jax.random.key(0), 12):
+        state = reset(key)
+        later = step(state, jnp.zeros(8))
+        black = [np.asarray(s.observation["eyes"] == 0).all(axis=(1, 2)) for s in (state, later)]
+        assert np.array_equal(*black)
+        closed.append(tuple(black[0].tolist()))
+    assert {(False, False), (True, False), (False, True)} == set(closed)
+
+
+def test_noise_is_drawn_anew_at_each_step(ant):
+    _, _, _ = ant
+    options = sight.Sight(number=1, noise=0.1)
+    drawn = sight.draw(jax.random.key(0), options)
+    flat = jnp.full((1, 32, 32), 128, jnp.uint8)
+    one, same, later = (sight.spoil(flat, drawn, jnp.float32(t), options) for t in (0.0, 0.0, 0.02))
+    assert np.array_equal(one, same) and not np.array_equal(one, later)
+    assert 20 < np.asarray(one, float).std() < 31
+
+
+def test_blur_keeps_the_mean_and_spreads_a_point():
+    point = jnp.zeros((1, 21, 21)).at[0, 10, 10].set(100.0)
+    seen = np.asarray(sight.blurred(point, 2.0))
+    assert np.isclose(seen.sum(), 100.0, rtol=1e-4)
+    rows = (seen[0].sum(1) * np.square(np.arange(21) - 10)).sum() / 100
+    assert np.isclose(rows, 4.0, rtol=0.05)
