@@ -248,6 +248,7 @@ class Run:
 
     def _pictures(self, physics: PhysicsState, readings: Any, task: dict) -> Array:
         """Returns what the eyes bring on, [E, H, W] uint8: this episode's whole course too."""
+        assert self.eyes is not None
         boxes = None
         if "course" in task:
             boxes = platform_boxes(task["course"], self.options.corridor_width)

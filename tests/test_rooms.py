@@ -21,6 +21,7 @@ MAY_IMPORT = {
     "physics": {"core", "exact"},
     "devices": {"core", "exact", "ppo"},
     "machine": {"core"},
+    "eyes": {"core", "ppo", "physics"},
     "checks": {"core", "exact", "physics", "machine"},
     "experiment": {"core", "ppo", "physics", "devices", "machine", "checks"},
     "runs": {"core", "exact", "ppo", "devices", "machine", "checks", "experiment"},
@@ -69,7 +70,7 @@ MODULES = {
 }
 # Rooms without effects, but for these: MuJoCo's C code is called on threads of its own, which must
 # be a pure function of its arguments; and XLA reads its flags from the environment.
-PURE = ("core", "exact", "ppo", "physics")
+PURE = ("core", "exact", "ppo", "physics", "eyes")
 HOST_CALLS = {"purerl.physics.engine_c", "purerl.physics.host_calls"}
 XLA_FLAGS = "purerl.exact.xla_flags"
 FORBIDDEN_CALLS = {"print", "open", "input", "exec", "eval", "__import__"}

@@ -25,9 +25,8 @@ class State(struct.PyTreeNode):
     """
 
     physics: PyTree  # all the physics needs to go on, and no more (PhysicsState)
-    observation: (
-        PyTree  # float32, pictures uint8: an array [O], or {"policy": [O], "privileged": [P]}
-    )
+    # An array [O], or {"policy": [O], "privileged": [P]}; float32, but pictures are uint8
+    observation: PyTree
     reward: Array  # [] float32
     terminated: Array  # [] bool: the task ended; nothing comes after
     truncated: Array  # [] bool: stopped for a reason outside the task; bootstrap from here

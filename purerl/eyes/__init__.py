@@ -1,9 +1,11 @@
-"""Eyes: what a body sees, as a pure function of where its parts are.
+"""Eyes: what a body sees, as a pure function of where its parts are, and networks that see.
 
-Here belong cameras, the shapes that rays hit, and how light makes an image of them.
+What belongs here: cameras on bodies, the shapes that rays meet, how light makes a picture of them.
+May import: core, ppo, physics. Read: `eye.py`, `eyes.py`, `casting.py`; then `networks.py`.
 """
 
 from purerl.eyes.eye import Eye as Eye, of_camera as of_camera, pair as pair
+from purerl.eyes.eyes import Eyes as Eyes
 from purerl.eyes.networks import (
     Encoder as Encoder,
     MlpOptions as MlpOptions,
@@ -11,4 +13,3 @@ from purerl.eyes.networks import (
     mlp as mlp,
     recurrent as recurrent,
 )
-from purerl.eyes.scene import Eyes as Eyes

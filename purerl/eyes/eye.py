@@ -2,25 +2,26 @@
 
 import dataclasses
 import math
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
 from purerl.physics import lookup
 
+Vector = tuple[float, float, float]
+
 
 @dataclasses.dataclass(frozen=True)
 class Eye:
-    """A camera on a body; its picture is square, and upright where the body is."""
+    """A camera on a body; its picture is upright where the body is."""
 
     body: str
     """Name of the body that carries it."""
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    position: Vector = (0.0, 0.0, 0.0)
     """In the body's frame [m]."""
-    direction: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    direction: Vector = (1.0, 0.0, 0.0)
     """Along which it looks, in the body's frame, of any length."""
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    up: Vector = (0.0, 0.0, 1.0)
     """What is above in its picture, in the body's frame, of any length."""
     fovy: float = 80.0
     """Angle between the picture's upper and lower edge [degrees]."""
@@ -35,13 +36,13 @@ class Eye:
                 "no upper side. Give two different directions."
             )
 
-
-class Place(NamedTuple):
-    """Where an eye is in the frame of its body."""
-
-    body: int
-    position: np.ndarray  # [3] [m]
-    axes: np.ndarray  # [3, 3]; columns: right, up, backwards, as of MuJoCo's cameras
+    @property
+    def axes(self) -> np.ndarray:
+        """[3, 3] in the body's frame; columns: right, up, backwards, as of MuJoCo's cameras."""
+        back = -np.array(self.direction) / np.linalg.norm(self.direction)
+        right = np.cross(self.up, back)
+        right /= np.linalg.norm(right)
+        return np.stack([right, np.cross(back, right), back], axis=1)
 
 
 def of_camera(model: mujoco.MjModel, name: str) -> Eye:
@@ -53,14 +54,9 @@ def of_camera(model: mujoco.MjModel, name: str) -> Eye:
     i = lookup.find(model, "camera", name)
     if model.cam_mode[i] != mujoco.mjtCamLight.mjCAMLIGHT_FIXED:
         raise ValueError(f"Camera {name!r} follows a body; an eye needs one of mode 'fixed'.")
-    axes = np.empty(9)
-    mujoco.mju_quat2Mat(axes, model.cam_quat[i])
-    _, up, back = axes.reshape(3, 3).T
-    body = model.body(model.cam_bodyid[i]).name
-    position = tuple(model.cam_pos[i].tolist())
-    return Eye(
-        body, position, tuple((-back).tolist()), tuple(up.tolist()), float(model.cam_fovy[i])
-    )
+    _, up, back = rotation(model.cam_quat[i]).T
+    body, fovy = model.body(model.cam_bodyid[i]).name, float(model.cam_fovy[i])
+    return Eye(body, _vector(model.cam_pos[i]), _vector(-back), _vector(up), fovy)
 
 
 def pair(eye: Eye, distance: float = 0.008, overlap: float = 57.0) -> tuple[Eye, Eye]:
@@ -77,33 +73,14 @@ def pair(eye: Eye, distance: float = 0.008, overlap: float = 57.0) -> tuple[Eye,
     if not 0.0 <= overlap <= eye.fovy:
         raise ValueError(f"overlap is {overlap}; give degrees, 0 to the eye's fovy, {eye.fovy}.")
     outwards = math.radians(eye.fovy - overlap) / 2
-    right, up, back = axes_of(eye).T
+    right, up, back = eye.axes.T
 
     def turned(side: int) -> Eye:
         direction = side * math.sin(outwards) * right - math.cos(outwards) * back
-        position = np.array(eye.position) + side * distance / 2 * right
-        return dataclasses.replace(
-            eye,
-            position=tuple(position.tolist()),
-            direction=tuple(direction.tolist()),
-            up=tuple(up.tolist()),
-        )
+        position = eye.position + side * distance / 2 * right
+        return Eye(eye.body, _vector(position), _vector(direction), _vector(up), eye.fovy)
 
     return turned(-1), turned(1)
-
-
-def axes_of(eye: Eye) -> np.ndarray:
-    """Returns an eye's axes in its body's frame, [3, 3]; columns: right, up, backwards."""
-    back = -np.array(eye.direction) / np.linalg.norm(eye.direction)
-    right = np.cross(eye.up, back)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(back, right), back], axis=1)
-
-
-def place(model: mujoco.MjModel, eye: Eye) -> Place:
-    """Looks an eye's body up."""
-    body = lookup.find(model, "body", eye.body)
-    return Place(body, np.array(eye.position, np.float32), axes_of(eye).astype(np.float32))
 
 
 def rays(fovy: float, size: tuple[int, int]) -> np.ndarray:
@@ -113,7 +90,18 @@ def rays(fovy: float, size: tuple[int, int]) -> np.ndarray:
     """
     height, width = size
     half = math.tan(math.radians(fovy) / 2)
-    right = (np.arange(width) + 0.5) * 2 / width - 1
-    up = 1 - (np.arange(height) + 0.5) * 2 / height
-    grid = np.meshgrid(half * width / height * right, half * up)
-    return np.stack([x.ravel() for x in grid]).astype(np.float32)
+    right = (2 * np.arange(width) + 1 - width) / height
+    up = (height - 1 - 2 * np.arange(height)) / height
+    return half * np.stack(np.meshgrid(right, up)).reshape(2, -1).astype(np.float32)
+
+
+def rotation(quat: np.ndarray) -> np.ndarray:
+    """Returns the rotation of a quaternion [4] as a matrix [3, 3]."""
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, quat)
+    return matrix.reshape(3, 3)
+
+
+def _vector(x: np.ndarray) -> Vector:
+    first, second, third = x.tolist()
+    return first, second, third

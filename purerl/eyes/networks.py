@@ -100,17 +100,11 @@ class Seeing(nn.Module):
     def __call__(self, observation: PyTree, *memory: PyTree) -> PolicyOutput | tuple:
         """Applies both to observations with pictures [..., E, H, W]."""
         pictures = observation[PICTURES]
-        if self.options.shared:
-            seen = Convolutions(self.options, name="eyes")(pictures)
-            seen = seen.reshape(*seen.shape[:-2], -1)
-        else:
-            each = [
-                Convolutions(self.options, name=f"eye{i}")(pictures[..., i, :, :])
-                for i in range(pictures.shape[-3])
-            ]
-            seen = jnp.concatenate(each, axis=-1)
+        number = pictures.shape[-3]
+        encoders = [Convolutions(self.options) for _ in range(1 if self.options.shared else number)]
+        seen = [encoders[i % len(encoders)](pictures[..., i, :, :]) for i in range(number)]
         rest = {name: x for name, x in observation.items() if name != PICTURES}
-        joined = jnp.concatenate([rest["policy"], seen], axis=-1)
+        joined = jnp.concatenate([rest["policy"], *seen], axis=-1)
         return self.network(rest | {"policy": joined}, *memory)
 
 
@@ -122,8 +116,8 @@ def mlp(options: MlpOptions, observation: PyTree, action_size: int) -> Network:
       observation: an example of one observation: a flat dict of arrays [O], and `eyes` [E, H, W].
       action_size: A.
     """
-    inner = networks.MlpActorCritic(options, action_size, parent=None)
     _check(observation)
+    inner = networks.MlpActorCritic(options, action_size, parent=None)
     return networks.from_linen(Seeing(options.eyes, inner), observation)
 
 
@@ -131,8 +125,7 @@ def recurrent(options: RecurrentOptions, observation: PyTree, action_size: int) 
     """Builds the GRU or LSTM network that sees; arguments as of `mlp`."""
     _check(observation)
     inner = networks.RecurrentActorCritic(options, action_size, parent=None)
-    zeros = jnp.zeros(options.hidden)
-    memory = zeros if options.cell == "gru" else (zeros, zeros)
+    memory = networks.no_memory(options)
     return networks.from_linen(Seeing(options.eyes, inner), observation, memory)
 
 
@@ -142,7 +135,7 @@ def _check(observation: PyTree) -> None:
     if getattr(pictures, "ndim", None) != 3:
         found = jax.tree.map(lambda x: (*x.shape,), observation)
         raise ValueError(
-            f"The observation is {found}; this network needs a dict with pictures [E, H, W] in "
-            f"the entry {PICTURES}, or is networks.mlp."
+            f"The observation is {found}; this network needs a dict with pictures [E, H, W] as its "
+            f"entry {PICTURES}. Without pictures, take networks.mlp or networks.recurrent."
         )
     networks.check_observation({k: x for k, x in observation.items() if k != PICTURES})

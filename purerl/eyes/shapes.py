@@ -7,6 +7,7 @@ in MuJoCo's renderer, which draws no surface from behind: an eye inside a skull 
 The letters: o [3] the origin, d three arrays [...] the directions, in the scaled frame.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -17,21 +18,23 @@ import numpy as np
 from purerl.core.records import Array
 
 _GEOM = mujoco.mjtGeom
+Vector = Sequence[Array]  # x, y and z
+UP = np.array([0.0, 0.0, 1.0], np.float32)
 
 
 class Kind(NamedTuple):
     """A kind of shape."""
 
     scale: Callable[[np.ndarray], np.ndarray]  # geom_size [3] -> [3] to divide by [m]
-    enter: Callable[[Array, Sequence[Array], Array], Array]  # o, d, length [] -> t [...]
+    enter: Callable[[Vector, Vector, Array], Array]  # o, d, length [] -> t [...]
     normal: Callable[[Array, Array], Array]  # point [..., 3], length [...] -> [..., 3], any length
 
 
-def _dot(x: Sequence[Array], y: Sequence[Array]) -> Array:
+def _dot(x: Vector, y: Vector) -> Array:
     return sum((p * q for p, q in zip(x[1:], y[1:], strict=True)), x[0] * y[0])
 
 
-def _round(o: Sequence[Array], d: Sequence[Array]) -> tuple[Array, Array]:
+def _round(o: Vector, d: Vector) -> tuple[Array, Array]:
     """Returns t of the entry into what is round in the coordinates given, and whether it is one.
 
     From the point nearest to the middle: b^2 - a c would cancel for a toe seen from afar.
@@ -47,11 +50,11 @@ def _ahead(t: Array, hit: Array) -> Array:
     return jnp.where(hit & (t > 0.0), t, jnp.inf)
 
 
-def _enter_ball(o: Array, d: Sequence[Array], length: Array) -> Array:
+def _enter_ball(o: Vector, d: Vector, length: Array) -> Array:
     return _ahead(*_round(o, d))
 
 
-def _enter_capsule(o: Array, d: Sequence[Array], length: Array) -> Array:
+def _enter_capsule(o: Vector, d: Vector, length: Array) -> Array:
     t, hit = _round(o[:2], d[:2])
     z = o[2] + t * d[2]
     at_end, hit_end = _round([o[0], o[1], o[2] - jnp.where(z > 0.0, length, -length)], d)
@@ -59,7 +62,7 @@ def _enter_capsule(o: Array, d: Sequence[Array], length: Array) -> Array:
     return _ahead(jnp.where(side, t, at_end), hit & (side | hit_end))
 
 
-def _enter_cylinder(o: Array, d: Sequence[Array], length: Array) -> Array:
+def _enter_cylinder(o: Vector, d: Vector, length: Array) -> Array:
     t = (jnp.sign(o[2]) * length - o[2]) / d[2]  # the lid on this side
     x, y = o[0] + t * d[0], o[1] + t * d[1]
     lid = _ahead(t, (jnp.abs(o[2]) > length) & (x * x + y * y <= 1.0))
@@ -68,21 +71,16 @@ def _enter_cylinder(o: Array, d: Sequence[Array], length: Array) -> Array:
     return jnp.minimum(_ahead(t, side), lid)
 
 
-def _enter_box(o: Array, d: Sequence[Array], length: Array) -> Array:
+def _enter_box(o: Vector, d: Vector, length: Array) -> Array:
     inverse = [1.0 / x for x in d]
     low = [(-1.0 - p) * i for p, i in zip(o, inverse, strict=True)]
     high = [(1.0 - p) * i for p, i in zip(o, inverse, strict=True)]
-    near, far = map(jnp.minimum, low, high), map(jnp.maximum, low, high)
-    enters, leaves = _fold(jnp.maximum, near), _fold(jnp.minimum, far)
+    enters = functools.reduce(jnp.maximum, map(jnp.minimum, low, high))
+    leaves = functools.reduce(jnp.minimum, map(jnp.maximum, low, high))
     return _ahead(enters, enters <= leaves)
 
 
-def _fold(function: Callable[[Array, Array], Array], three: Sequence[Array]) -> Array:
-    x, y, z = three
-    return function(function(x, y), z)
-
-
-def _enter_plane(o: Array, d: Sequence[Array], length: Array) -> Array:
+def _enter_plane(o: Vector, d: Vector, length: Array) -> Array:
     return _ahead(-o[2] / d[2], (o[2] > 0.0) & (d[2] < 0.0))
 
 
@@ -91,13 +89,12 @@ def _normal_of_ball(p: Array, length: Array) -> Array:
 
 
 def _normal_of_capsule(p: Array, length: Array) -> Array:
-    return p.at[..., 2].add(-jnp.clip(p[..., 2], -length, length))
+    return p - UP * jnp.clip(p, -length[..., None], length[..., None])
 
 
 def _normal_of_cylinder(p: Array, length: Array) -> Array:
     on_lid = jnp.abs(p[..., 2]) > length * (1.0 - 1e-4)
-    axis = jnp.array([0.0, 0.0, 1.0])
-    return jnp.where(on_lid[..., None], jnp.sign(p) * axis, p * (1.0 - axis))
+    return jnp.where(on_lid[..., None], jnp.sign(p) * UP, p * (1.0 - UP))
 
 
 def _normal_of_box(p: Array, length: Array) -> Array:
@@ -106,7 +103,7 @@ def _normal_of_box(p: Array, length: Array) -> Array:
 
 
 def _normal_of_plane(p: Array, length: Array) -> Array:
-    return jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), p.shape)
+    return jnp.broadcast_to(UP, p.shape)
 
 
 # In this order shapes stand in a scene. Boxes are last: those of an episode follow the model's.

@@ -8,6 +8,8 @@ It may have two methods:
 - `scenery(state) -> (centers [P, 3], half_sizes [P, 3])` [m]: boxes that belong to the episode but
   are not all in the model at once, such as the far platforms of a corridor. Only drawn.
 
+What its eyes see, the observation's entry "eyes" [E, H, W] uint8, is drawn beside it.
+
 OpenGL is the caller's.
 """
 
@@ -31,14 +33,16 @@ class Picture(NamedTuple):
     mocap_quat: Array  # [..., nmocap, 4]
     changes: dict[str, Array]  # MjModel field -> its values
     scenery: tuple[Array, ...]  # () or centers and half sizes of boxes, [..., P, 3] each [m]
+    eyes: tuple[Array, ...] = ()  # () or one array of what they see, [..., E, H, W] uint8
 
 
 def take_picture(env: Any, state: State) -> Picture:
     """Keeps what decides how one environment's state looks."""
     changes = env.model_changes(state) if hasattr(env, "model_changes") else {}
     scenery = env.scenery(state) if hasattr(env, "scenery") else ()
-    physics = state.physics
-    return Picture(physics.qpos, physics.mocap_pos, physics.mocap_quat, changes, tuple(scenery))
+    p, seen = state.physics, state.observation
+    eyes = (seen["eyes"],) if isinstance(seen, dict) and "eyes" in seen else ()
+    return Picture(p.qpos, p.mocap_pos, p.mocap_quat, changes, tuple(scenery), eyes)
 
 
 class Stage:
@@ -95,6 +99,24 @@ class Stage:
         own = self.model.body_rootid[self.model.geom_bodyid] == self.root
         away = np.linalg.norm(self.data.geom_xpos[own] - self.data.subtree_com[self.root], axis=1)
         return float(np.max(away + self.model.geom_rbound[own], initial=least))
+
+
+def seen_by_eyes(picture: Picture, width: int) -> np.ndarray:
+    """Returns what the eyes see side by side, [height, at most `width`, 3] uint8, or more if they
+    have more pixels, each of which becomes a square."""
+    seen = np.concatenate(np.asarray(picture.eyes[0]), axis=1)
+    edge = max(1, width // seen.shape[1])
+    return seen.repeat(edge, 0).repeat(edge, 1)[:, :, None].repeat(3, 2)
+
+
+def add_eyes(frame: np.ndarray, picture: Picture) -> np.ndarray:
+    """Returns a frame [height, width, 3] with what the eyes see in its upper right corner."""
+    if not picture.eyes:
+        return frame
+    height, width, _ = frame.shape
+    seen, frame = seen_by_eyes(picture, width // 3)[:height, :width], frame.copy()
+    frame[: seen.shape[0], -seen.shape[1] :] = seen
+    return frame
 
 
 def add_scenery(scene: mujoco.MjvScene, scenery: tuple[Array, ...]) -> None:

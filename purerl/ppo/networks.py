@@ -204,6 +204,11 @@ def recurrent(options: RecurrentOptions, observation: PyTree, action_size: int) 
       action_size: A.
     """
     check_observation(observation)
+    module = RecurrentActorCritic(options, action_size)
+    return from_linen(module, observation, no_memory(options))
+
+
+def no_memory(options: RecurrentOptions) -> PyTree:
+    """Returns the memory with which an episode starts, leaves [H]."""
     zeros = jnp.zeros(options.hidden)
-    memory = zeros if options.cell == "gru" else (zeros, zeros)
-    return from_linen(RecurrentActorCritic(options, action_size), observation, memory)
+    return zeros if options.cell == "gru" else (zeros, zeros)

@@ -52,11 +52,11 @@ class Moments(NamedTuple):
 def init(example: PyTree) -> Statistics:
     """Returns statistics of nothing (mean 0, variance 1) for features shaped like `example` [O]."""
 
-    def full(value: float) -> PyTree:
-        def one(x: Array) -> Compensated:
-            return Compensated(jnp.full_like(x, value), jnp.zeros_like(x))
+    example = _measured(example)
 
-        return jax.tree.map(one, _measured(example))
+    def full(value: float) -> PyTree:
+        fill = jnp.full_like
+        return jax.tree.map(lambda x: Compensated(fill(x, value), jnp.zeros_like(x)), example)
 
     # With count 0 the first batch has the share 1: it replaces these numbers, and mixes with none.
     return Statistics(count=zero_count(), mean=full(0.0), variance=full(1.0))

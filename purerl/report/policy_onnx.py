@@ -18,6 +18,7 @@ from purerl.report.flat_program import batched, flat_program
 from purerl.report.onnx_nodes import OPSET, Nodes
 from purerl.runs.loaded_run import Run
 
+KINDS = {"tensor(uint8)": np.uint8}  # of inputs other than float32
 IR_VERSION = 8  # the file format that goes with the operator set
 
 
@@ -66,8 +67,8 @@ def build_model(
     made = jax.tree.leaves(jax.eval_shape(outputs, *batched(arguments)))
     nodes = Nodes(given)
     nodes.write(program, taken)
-    read = [_info(n, x.shape) for n, x in zip(given, jax.tree.leaves(arguments), strict=True)]
-    results = [_info(name, x.shape[1:]) for name, x in zip(taken, made, strict=True)]
+    read = [_info(n, x.shape, x) for n, x in zip(given, jax.tree.leaves(arguments), strict=True)]
+    results = [_info(name, x.shape[1:], x) for name, x in zip(taken, made, strict=True)]
     graph = helper.make_graph(nodes.nodes, "policy", read, results, nodes.constants)
     opset = [helper.make_opsetid("", OPSET)]
     model = helper.make_model(graph, opset_imports=opset, ir_version=IR_VERSION)
@@ -75,20 +76,22 @@ def build_model(
     return model
 
 
-def _info(name: str, shape: tuple[int, ...]) -> onnx.ValueInfoProto:
-    return helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["batch", *shape])
+def _info(name: str, shape: tuple[int, ...], like: Any) -> onnx.ValueInfoProto:
+    kind = helper.np_dtype_to_tensor_dtype(np.dtype(like.dtype))
+    return helper.make_tensor_value_info(name, kind, ["batch", *shape])
 
 
 def caller(file: Path) -> Callable[[PyTree, PyTree], tuple[np.ndarray, PyTree]]:
     """Returns the file's function of (observation, memory), by onnxruntime on the CPU."""
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
-    given = [entry.name for entry in session.get_inputs()]
+    given = session.get_inputs()
     taken = [entry.name for entry in session.get_outputs() if entry.name != "control"]
 
     def call(observation: PyTree, memory: PyTree) -> tuple[np.ndarray, PyTree]:
         leaves, tree = jax.tree.flatten(memory)
         values = [*jax.tree.leaves(observation), *leaves]
-        arrays = {n: np.asarray(x, np.float32) for n, x in zip(given, values, strict=True)}
+        pairs = zip(given, values, strict=True)
+        arrays = {e.name: np.asarray(x, KINDS.get(e.type, np.float32)) for e, x in pairs}
         action, *following = session.run(taken, arrays)
         return action, jax.tree.unflatten(tree, following)
 

@@ -9,8 +9,15 @@ import numpy as np
 
 from purerl.core.errors import UserError
 
-# The last one is for rooms that may not import physics.
-from purerl.physics.drawing import Picture, Stage, add_scenery, root_body  # noqa: F401
+# The last two are for rooms that may not import physics.
+from purerl.physics.drawing import (  # noqa: F401
+    Picture,
+    Stage,
+    add_eyes,
+    add_scenery,
+    root_body,
+    seen_by_eyes,
+)
 from purerl.report.opengl import open_gl
 
 
@@ -67,4 +74,4 @@ class Renderer(contextlib.AbstractContextManager):
         mujoco.mjr_render(self.size, self.scene, self.context)
         frame = np.empty((self.size.height, self.size.width, 3), np.uint8)
         mujoco.mjr_readPixels(frame, None, self.size, self.context)
-        return frame[::-1]  # OpenGL counts rows from below
+        return add_eyes(frame[::-1], picture)  # OpenGL counts rows from below

@@ -105,7 +105,7 @@ def _flatten(observation: Any, example: PyTree) -> tuple[tuple[int, ...], PyTree
             "between steps; docs/howto/own_loop.md has whole episodes compiled."
         )
     try:
-        arrays = jax.tree.map(lambda _, x: np.asarray(x, np.float32), example, observation)
+        arrays = jax.tree.map(lambda one, x: np.asarray(x, one.dtype), example, observation)
     except (TypeError, ValueError):
         arrays = None
     pairs = list(zip(jax.tree.leaves(arrays), jax.tree.leaves(example), strict=False))

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from purerl import eyes
-from purerl.eyes.eye import axes_of
-from purerl.eyes.scene import ABYSS, CONTRAST, SHADE, SKY
+from purerl.eyes.eyes import ABYSS, CONTRAST, SHADE, SKY
 
 KINDS = {
     "plane": '<geom type="plane" size="0 0 1" pos="0 0 -.4" euler="5 3 0"/>',
@@ -59,7 +58,7 @@ def picture(sight: eyes.Eyes, *places) -> np.ndarray:
 
 def rays_of_mujoco(model, data, eye: eyes.Eye, size: int) -> np.ndarray:
     """Distances [size, size] along rays, by `mj_ray`; inf where it meets nothing."""
-    axes = data.body(eye.body).xmat.reshape(3, 3) @ axes_of(eye)
+    axes = data.body(eye.body).xmat.reshape(3, 3) @ eye.axes
     start = data.body(eye.body).xpos + data.body(eye.body).xmat.reshape(3, 3) @ eye.position
     half, found = np.tan(np.radians(eye.fovy / 2)), np.zeros((size, size))
     for row, column in np.ndindex(size, size):
@@ -212,7 +211,7 @@ def test_a_camera_of_the_model_is_an_eye():
         (lambda: eyes.of_camera(model_of(), "owm"), "There is no camera 'owm'. Did you mean 'own'"),
         (lambda: eyes.of_camera(model_of(), "after"), "Camera 'after' follows a body"),
         (lambda: eyes.Eyes(model_of(), [eyes.Eye("had")]), "There is no body 'had'"),
-        (lambda: eyes.Eyes(model_of(), [EYE], hide=["x"]), "body or geom in hide"),
+        (lambda: eyes.Eyes(model_of(), [EYE], hide=["x"]), "There is no body or geom 'x'"),
         (lambda: eyes.Eyes(model_of(), [EYE], (0, 3)), "all are above 0"),
         (lambda: eyes.Eyes(model_of(), []), "give at least one eye"),
         (lambda: eyes.Eyes(mesh(), [EYE]), "do not see a mesh, and geom 'stone' is one"),

@@ -14,6 +14,7 @@ from typing import Any
 import viser
 
 from purerl.report.html_elements import Html
+from purerl.report.renderer import seen_by_eyes
 from purerl.tune.option_numbers import Place, bounds, label
 from purerl.tune.view import gate, readouts, session as events
 from purerl.tune.view.scene import Scene
@@ -30,7 +31,7 @@ PLOTS = {
     "Actions": readouts.action_plot,
 }
 AS_IN_FILE = "# as in the experiment's file"  # as high as the overrides of one slider
-PLOT_HEIGHT, PANEL_WIDTH = 190, 380  # [pixels]
+PLOT_HEIGHT, PANEL_WIDTH, EYES_WIDTH = 190, 380, 320  # [pixels]
 MOST_EVENTS = 1000  # that wait to be played
 
 
@@ -53,6 +54,7 @@ class Page:
         self.plots: dict[str, Any] = {}
         self.names: dict[str, tuple[str, ...]] = {}  # of each plot's lines
         self.checkpoints: Any = None
+        self.eyes: Any = None
 
     @property
     def watched(self) -> bool:
@@ -186,6 +188,18 @@ class Page:
         if self.sliders:
             _show(self.words, readouts.as_typed(words or AS_IN_FILE))
         self._draw_plots(session)
+        self._draw_eyes(session)
+
+    def _draw_eyes(self, session: Session) -> None:
+        """Shows what the body's eyes see, if it has some."""
+        if not session.picture.eyes:
+            return
+        seen = seen_by_eyes(session.picture, EYES_WIDTH)
+        if self.eyes is None:
+            with self.tab:
+                self.eyes = self.server.gui.add_image(seen, label="Eyes")
+        else:
+            self.eyes.image = seen
 
     def _draw_plots(self, session: Session) -> None:
         """Draws the lines; with fewer than two points uPlot has no scale, and they stay."""
