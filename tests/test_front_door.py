@@ -16,7 +16,7 @@ import purerl
 from purerl import __main__ as commands
 
 ROOT = Path(__file__).parent.parent
-MODULES = {"adapters", "exact", "lookup", "networks", "planner"}
+MODULES = {"adapters", "exact", "eyes", "lookup", "networks", "planner"}
 BESIDE = ("purerl.envs", "purerl.experiments")  # of this repository, as these files themselves
 NAMES = purerl.__all__
 # They measure the insides.
@@ -226,7 +226,7 @@ def test_the_list_of_experiments_is_what_a_newcomer_wants_to_see():
 
     names = [name for name, path in available().items() if path.parent == ROOT / "experiments"]
     assert names == [
-        "cartpole_swingup", "ant_run", "ant_gaps", "rodent_run", "rodent_gaps", "suite",
-        "suite_gpu", "suite_humanoid", "custom_network",
+        "cartpole_swingup", "ant_run", "ant_gaps", "ant_gaps_eyes", "rodent_run", "rodent_gaps",
+        "suite", "suite_gpu", "suite_humanoid", "custom_network",
     ]  # fmt: skip
     assert all(len(summary(available()[name])) < 90 for name in names)

@@ -72,6 +72,7 @@ def check_trial(trial: check_env.Trial) -> Iterator[Finding]:
     if broken.level == "ok":
         yield check_reward(trial)
         yield from check_scale(trial)
+        yield from check_pictures(trial)
         yield check_actions(trial)
 
 
@@ -200,6 +201,25 @@ def check_scale(trial: check_env.Trial) -> Iterator[Finding]:
                 yield warning("scale", f"{name} {places} {what}: {_cure(what)}.")
     if not number:
         yield ok("scale", "every entry of the observation varies, at a sound scale")
+
+
+def check_pictures(trial: check_env.Trial) -> Iterator[Finding]:
+    """Warns of eyes, a picture [H, W] uint8 each, that see nothing, or nothing that moves."""
+    start, later = flatten(trial.start.observation), flatten(trial.states.observation)
+    for name in (n for n, x in start.items() if x.dtype == np.uint8):
+        seen = np.concatenate([start[name][None], later[name]]) / 255.0
+        for eye in range(seen.shape[2]) if seen.ndim == 5 else ():
+            one, what = seen[:, :, eye], f"eye {eye} of observation/{name}"
+            if np.ptp(one) == 0:
+                said = f"{what} is the same grey, {one.flat[0]:.2g}, everywhere: nothing is in view"
+                yield warning("eyes", f"{said}, or it is closed or inside of something.")
+            elif not (moves := np.ptp(one, axis=0).any(0)).any():
+                yield warning("eyes", f"{what}: nothing moves in it, whatever the body does.")
+            else:
+                said = (
+                    f"contrast {one.std():.2f}, where white is 1; {moves.mean():.0%} of its pixels"
+                )
+                yield ok("eyes", f"{what}: {said} move")
 
 
 def _cure(what: str) -> str:

@@ -116,7 +116,9 @@ def _check_inputs(of_value: PyTree, of_policy: PyTree) -> Iterator[Finding]:
     own = [k for k in entries if k in ("", "policy")]
     if own and own[0] not in reads["policy"]:
         yield warning("inputs", f"the policy does not depend on {_observations(own)}.")
-    secret = [k for k in reads["policy"] if k not in ("", "policy")]
+    # What has more axes than features have is a picture, which the policy's own eyes may see.
+    flat = [k for k, x in flatten(of_policy).items() if x.ndim < 3]
+    secret = [k for k in reads["policy"] if k in flat and k not in ("", "policy")]
     if "policy" in entries and secret:
         yield warning("inputs", f"the policy reads {_observations(secret)}: only `policy` is its.")
     if not blind and not secret:

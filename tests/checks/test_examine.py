@@ -478,3 +478,19 @@ def test_what_init_and_step_are_given(given, late, said):
     assert set(found) == set(said)
     for about, text in said.items():
         assert re.search(text, found[about])
+
+
+def test_eyes_that_see_nothing_or_nothing_that_moves_are_told():
+    """No training: pictures of 3 environments, 4 steps."""
+    random = np.random.default_rng(0)
+    still = np.broadcast_to(random.integers(0, 255, (3, 1, 5, 5), np.uint8), (5, 3, 1, 5, 5))
+    moving = random.integers(0, 255, (5, 3, 1, 5, 5), np.uint8)
+    pictures = np.concatenate([np.full_like(moving, 230), still, moving], axis=2)
+
+    start, states = (SimpleNamespace(observation={"eyes": x}) for x in (pictures[0], pictures[1:]))
+    trial = SimpleNamespace(start=start, states=states)
+    said = [f"{one.level}: {one.text}" for one in examine_env.check_pictures(trial)]
+    assert len(said) == 3
+    assert "eye 0 of observation/eyes is the same grey, 0.9, everywhere" in said[0]
+    assert "eye 1 of observation/eyes: nothing moves in it" in said[1]
+    assert "100% of its pixels move" in said[2]
