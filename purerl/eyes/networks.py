@@ -86,7 +86,7 @@ class Convolutions(nn.Module):
                     ": leave that layer out, or give smaller strides before it."
                 )
             x = nn.relu(nn.Dense(width)(windows(x, kernel, stride)))
-        x = nn.LayerNorm()(nn.Dense(o.features)(x.reshape(len(x), -1)))
+        x = nn.LayerNorm()(nn.Dense(o.features)(x.reshape(x.shape[0], -1)))
         return nn.relu(x).reshape(*batch, o.features)
 
 
