@@ -92,13 +92,8 @@ def check_shapes(env: Env) -> None:
     fresh = shapes_of_reset(env)
     check_fields(fresh)
     action = jax.ShapeDtypeStruct((env.action_size,), jnp.float32)
-    try:
-        following = jax.eval_shape(env.step, fresh, action)
-    except Exception as error:
-        raise EnvError(
-            f"step cannot be traced with an action of env.action_size = {env.action_size} "
-            f"numbers, as jit needs: {in_words(error)}{own_line(error)}"
-        ) from error
+    given = f" with an action of env.action_size = {env.action_size} numbers"
+    following = _trace(f"step cannot be traced{given}", env.step, fresh, action)
     if not isinstance(following, State):
         raise EnvError(f"step returned a {type(following).__name__}: it must return env.State.")
     _check_same(_specs(fresh), _specs(following))
@@ -106,11 +101,15 @@ def check_shapes(env: Env) -> None:
 
 def shapes_of_reset(env: Env) -> Any:
     """Returns the shapes of what reset returns; EnvError if it cannot be traced."""
+    return _trace("reset cannot be traced", env.reset, jax.random.key(0))
+
+
+def _trace(failed: str, function: Callable[..., Any], *arguments: Any) -> Any:
     try:
-        return jax.eval_shape(env.reset, jax.random.key(0))
+        return jax.eval_shape(function, *arguments)
     except Exception as error:
         what = f"{in_words(error)}{own_line(error)}"
-        raise EnvError(f"reset cannot be traced, as jit needs: {what}") from error
+        raise EnvError(f"{failed}, as jit needs: {what}") from error
 
 
 def check_members(env: Env) -> None:
@@ -126,8 +125,8 @@ def check_members(env: Env) -> None:
     timestep = env.control_timestep
     if not isinstance(timestep, int | float) or not 0 < timestep < float("inf"):
         raise EnvError(
-            f"env.control_timestep is {timestep!r}: it must be a positive number of "
-            "seconds (a Python float)."
+            f"env.control_timestep is {timestep!r:.60}: it must be a positive number of "
+            "seconds (a Python float; a method of that name needs @property above it)."
         )
     size = env.action_size
     if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 1:
@@ -151,8 +150,7 @@ def check_fields(state: Any) -> None:
         raise EnvError(
             f"metrics has the name {name!r}, which is the trainer's own: give the metric another."
         )
-    for name, value in state.metrics.items():
-        scalars[f"metrics[{name!r}]"] = (value, jnp.float32)
+    scalars |= {f"metrics[{name!r}]": (x, jnp.float32) for name, x in state.metrics.items()}
     for name, (value, dtype) in scalars.items():
         if not hasattr(value, "dtype") or value.shape != () or value.dtype != dtype:
             raise EnvError(

@@ -73,7 +73,8 @@ def check_solver(env: Env, physics: Any, trial: Trial) -> Iterator[Finding]:
     gap, moved = (np.abs(x - best)[good].max() for x in (own, old))
     what = f"{opt.iterations} iterations ({opt.ls_iterations} of line search)"
     said = f"after one control step qpos is up to {gap:.2g} from a converged solver's, by {what}"
+    mend = "raise them" + ", or take Newton" * (opt.solver != NEWTON)
     if gap <= SOLVED * moved:
         yield ok("solver", said)
     else:
-        yield warning("solver", f"{said}; it moves by {moved:.2g}: raise them, or take Newton.")
+        yield warning("solver", f"{said}; it moves by {moved:.2g}: {mend}.")

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import jax
 from jax._src import callback, dispatch  # JAX has no public way to forget one that failed
 
 from purerl.core.errors import RunError, UserError, one_line
@@ -16,33 +15,29 @@ from purerl.core.errors import RunError, UserError, one_line
 # Code of this library and of installed packages is not the user's.
 _OTHERS = ("site-packages", "dist-packages", "<", str(Path(__file__).parent.parent))
 _LATER = "a value that is known only when the compiled program runs"
-_TRACED = (
-    (
-        jax.errors.TracerBoolConversionError,
-        f"a Python `if`, `while`, `and`, `or` or `not` asks for {_LATER}; use jnp.where, "
-        "jnp.logical_and or jax.lax.cond",
-    ),
-    (
-        jax.errors.TracerArrayConversionError,
-        f"numpy was given {_LATER}; use jax.numpy (jnp) in place of numpy (np)",
-    ),
-    (
-        (jax.errors.ConcretizationTypeError, jax.errors.TracerIntegerConversionError),
-        f"float(), int(), an index or a shape asks for {_LATER}; keep it an array "
-        "(x.astype(jnp.float32)), and sizes constant",
-    ),
-)
+_SIZES = f"float(), int(), an index or a shape asks for {_LATER}; keep it an array "
+_SIZES += "(x.astype(jnp.float32)), and sizes constant"
+_TRACED = {
+    "TracerBoolConversionError": f"a Python `if`, `while`, `and`, `or` or `not` asks for {_LATER}; "
+    "use jnp.where, jnp.logical_and or jax.lax.cond",
+    "TracerArrayConversionError": f"numpy was given {_LATER}; use jax.numpy (jnp) in place of "
+    "numpy (np)",
+    "ConcretizationTypeError": _SIZES,
+    "TracerIntegerConversionError": _SIZES,
+}
+_MENDS = {  # by what the error says
+    "invalid PRNG key": "the key comes first, as in jax.random.split(key, 3)",
+    "'Readings' object has no": "name it where the Physics is made: Physics(model, (NAME, ...))",
+    "cannot assign to field": "an environment stays as it was built: put it into State.task",
+    "Error opening file": "write Path(__file__).parent / NAME, or start where the file is",
+}
 
 
 def in_words(error: BaseException) -> str:
     """Returns an error of a user's function as one line; of JAX's tracing in a person's words."""
-    for kinds, words in _TRACED:
-        if isinstance(error, kinds):
-            return words
-    said = one_line(error)
-    if isinstance(error, TypeError) and "PRNG key" in said:
-        return f"{said}; the key comes first, as in jax.random.split(key, 3)"
-    return said
+    said = _TRACED.get(type(error).__name__) or one_line(error)
+    mends = (mend for part, mend in _MENDS.items() if part in said and mend not in said)
+    return "; ".join([said, *mends])
 
 
 def own_line(error: BaseException | None) -> str:

@@ -79,6 +79,7 @@ def wrong_value(record: Any, path: str = "") -> str:
     >>> wrong_value(Config(num_steps=10_000, num_epochs=2.5))
     'num_epochs is 2.5; it must be a whole number.'
     """
+    own = type(record).__module__.startswith("purerl.")  # ours say where None may stand
     for name in _without_annotation(type(record)):
         return f"{path}{name} has no annotation, so it is no setting: write `{name}: float`, say."
     for name, hint in hints(type(record)).items():
@@ -86,7 +87,7 @@ def wrong_value(record: Any, path: str = "") -> str:
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             if wrong := wrong_value(value, f"{where}."):
                 return wrong
-        elif (value is not None or _is_own(record)) and not fits(hint, value, exact=True):
+        elif (value is not None or own) and not fits(hint, value, exact=True):
             return f"{where} is {value!r}; it must be {_in_words(hint)}."
     return ""
 
@@ -102,11 +103,6 @@ def _without_annotation(kind: type) -> list[str]:
     ]
 
 
-def _is_own(record: Any) -> bool:
-    """Tells whether a dataclass is the library's, whose annotations say where None may stand."""
-    return type(record).__module__.startswith("purerl.")
-
-
 def _in_words(hint: Any) -> str:
     inner = get_args(hint)
     if get_origin(hint) is Literal:
@@ -119,6 +115,8 @@ def _in_words(hint: Any) -> str:
 def suggest_field(error: str, *kinds: type) -> str:
     """Returns a hint where one of these dataclasses was called with a name that it lacks, or ""."""
     found = re.search(r"(\w+)\.__init__\(\) got an unexpected keyword argument '(\w+)'", error)
+    if "missing" in error and "'action_size'" in error:
+        return "; give the function itself: build_network=networks.mlp"
     known = {kind.__name__: dataclasses.fields(kind) for kind in kinds}
     if not found or found[1] not in known:
         return ""

@@ -64,10 +64,9 @@ def _has_experiment(path: Path) -> bool:
 
 def summary(path: Path) -> str:
     """Returns the first line of a file's docstring, without running the file."""
-    try:
+    text = None
+    with contextlib.suppress(OSError, SyntaxError, ValueError):
         text = ast.get_docstring(ast.parse(path.read_bytes()))
-    except (OSError, SyntaxError, ValueError):
-        text = None
     return text.splitlines()[0] if text else ""
 
 
@@ -169,14 +168,17 @@ def _mistakes(file: str, place: Path, of_run: bool) -> Iterator[None]:
     try:
         yield
     except SyntaxError as error:
-        raise UserError(f"{error.filename}, line {error.lineno}: {error.msg}.") from error
+        raise UserError(f"{error.filename}, line {error.lineno}: {error.msg}") from error
     except Exception as error:
         lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == file]
         where = f", line {lines[-1]}" if lines else ""
         hint = _import_hint(error, place) if isinstance(error, ImportError) else ""
         if "from purerl" in hint and of_run:
             hint += ". The run was made by an older purerl: train it anew."
-        hint = hint or suggest_field(str(error), Config, Evaluation, Experiment)
+        from purerl.ppo.networks import MlpOptions, RecurrentOptions  # here, as it starts JAX
+
+        kinds = (Config, Evaluation, Experiment, MlpOptions, RecurrentOptions)
+        hint = hint or suggest_field(str(error), *kinds)
         said = re.sub(r"('purerl[.\w]*') \(.*\)$", r"\1", one_line(error))
         raise UserError(f"{file}{where}: {said}{hint}") from error
 

@@ -117,6 +117,7 @@ class Physics:
                 f"model is a {type(model).__name__}; it must be a mujoco.MjModel, such as "
                 "mujoco.MjModel.from_xml_path(path)."
             )
+        readings = (readings,) if isinstance(readings, str) else tuple(readings)
         self.engine = choose_engine(engine)
         _check_model(model, tuple(n for n in readings if n != "overflow" or self.engine == "jax"))
         check_left_out(model, self.engine)
@@ -127,7 +128,7 @@ class Physics:
         self.reads_forces = bool({*_ACCELERATION, *["sensordata"] * bool(late)} & {*readings})
         self._follows = functools.cache(functools.partial(consequences, copy.copy(model)))
         self.control_timestep = substeps * float(model.opt.timestep)
-        record: Any = collections.namedtuple("Readings", list(readings))  # type: ignore[misc]
+        record: Any = collections.namedtuple("Readings", readings)  # type: ignore[misc]
         self._engine = _build_engine(self.engine, model, record, substeps)
 
     def __deepcopy__(self, memo: dict) -> "Physics":

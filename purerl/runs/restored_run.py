@@ -63,7 +63,7 @@ def restore(
         what = f"{one_line(error)}{own_line(error)}"
         raise UserError(f"{folder} cannot be built with its {CONFIG}: {what}") from error
     for what in _changed_since(begun, source, setup):
-        say(f"{what} is not that of the run any more.")
+        say(f"{folder}: {what} is not that of the run any more.")
     for what in edited(run):
         say(f"Edited since the run: {what}.")
     return RestoredRun(chosen, setup, _read_checkpoint(run, update, setup, say), source, run)

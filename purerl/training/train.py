@@ -83,6 +83,8 @@ def train(
         )
     set_xla_flags_in_time()
     listener = options.pop("on_metrics", None)
+    if not (listener is None or callable(listener)):
+        raise UserError(f"on_metrics is {listener!r}; it must be a function of a line of metrics.")
     source = find_source(str(experiment))
     chosen, how = from_settings(source, settings or {}, options, choose=as_begun)
     if how.video:

@@ -305,19 +305,23 @@ class Balls(Toy):
         return toy_state(physics.qpos[:2]).replace(physics=physics)
 
 
-def balls(angle="radian", range="-1 1", iterations=100, **how):  # noqa: A002
+def balls(angle="radian", range="-1 1", iterations=100, solver="CG", **how):  # noqa: A002
     model = mujoco.MjModel.from_xml_string(BALL.format(angle=angle, range=range))
-    model.opt.solver, model.opt.iterations = mujoco.mjtSolver.mjSOL_CG, iterations
+    solver = getattr(mujoco.mjtSolver, f"mjSOL_{solver}")
+    model.opt.solver, model.opt.iterations = solver, iterations
     return Balls(physics=Physics(model, (), 5, "c"), **how)
 
 
-@pytest.mark.parametrize(("iterations", "found"), [(100, False), (1, True)])
-def test_a_solver_that_does_not_converge(iterations, found):
-    env = balls(iterations=iterations)
+@pytest.mark.parametrize(
+    ("solver", "iterations", "found"), [("CG", 100, False), ("CG", 1, True), ("NEWTON", 1, True)]
+)
+def test_a_solver_that_does_not_converge(solver, iterations, found):
+    env = balls(iterations=iterations, solver=solver)
     said = list(check_model(env, check_env.try_out(env, 4, 5)))
     assert [one.about for one in said] == ["solver"]
     assert (said[0].level == "warning") == found
     assert f"by {iterations} iterations (50 of line search)" in said[0].text
+    assert ("or take Newton" in said[0].text) == (found and solver == "CG")
 
 
 @pytest.mark.parametrize(

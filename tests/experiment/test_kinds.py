@@ -49,7 +49,7 @@ def test_a_value_of_the_wrong_kind_is_told_and_never_trained(experiment, told):
 
 
 def test_a_text_for_a_number_is_told_by_its_setting():
-    with pytest.raises(ValueError, match="learning_rate is '3e-4'; it must be above 0"):
+    with pytest.raises(ValueError, match="learning_rate is '3e-4'; it must be a number above 0"):
         changed("ppo", learning_rate="3e-4")
 
 
