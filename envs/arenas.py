@@ -21,6 +21,7 @@ from purerl import Array
 from purerl.envs.bodies import Body
 
 GROUND = "ground"  # the floor's geom; a corridor's boxes are ground_0, ground_1, ...
+TARGET = "target"  # body and geom of the floor's orb
 _THICKNESS = 0.16  # half height of a platform, as in dm_control [m]
 
 
@@ -29,6 +30,7 @@ class Floor:
     """A flat floor without end."""
 
     tile: float = 1.0  # edge of one square of the checker pattern [m]
+    orb: float = 0.0  # radius of a ball that can be anywhere and hinders nothing; 0: none [m]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +121,12 @@ def _build_floor(arena: Floor) -> mjcf.RootElement:
     dm_floor = floors.Floor(name="arena", size=(100, 100), reflectance=0.0)
     dm_floor.ground_geoms[0].name = GROUND
     dm_floor.ground_geoms[0].material.texrepeat = [2 / arena.tile] * 2
-    return dm_floor.mjcf_model
+    root = dm_floor.mjcf_model
+    if arena.orb:
+        body = root.worldbody.add("body", name=TARGET, mocap=True)
+        white = {"contype": 0, "conaffinity": 0, "rgba": [1, 1, 1, 1]}
+        body.add("geom", name=TARGET, type="sphere", size=[arena.orb], **white)
+    return root
 
 
 def _remove_walls(root: mjcf.RootElement) -> None:

@@ -14,7 +14,15 @@ import numpy as np
 from dm_control import mjcf
 
 from purerl import choose_engine, lookup
-from purerl.envs.arenas import GROUND, Arena, BoxFields, box_fields, build_arena, check_passable
+from purerl.envs.arenas import (
+    GROUND,
+    TARGET,
+    Arena,
+    BoxFields,
+    box_fields,
+    build_arena,
+    check_passable,
+)
 from purerl.envs.bodies import Body
 
 PREFIX = "walker/"  # composing puts it before the names of the body's parts
@@ -145,7 +153,7 @@ def mask_contacts(model: mujoco.MjModel, body: Body, self_collision: bool) -> No
     for i in range(model.ngeom):
         name = model.geom(i).name
         part = name.removeprefix(PREFIX)
-        ground = not name.startswith(PREFIX)
+        ground = not name.startswith(PREFIX) and name != TARGET
         chosen = part in body.ground_geoms if body.ground_geoms else model.geom_contype[i] > 0
         model.geom_contype[i] = 0 if ground else int(chosen)
         # As shipped, a geom with conaffinity 0 touches the ground and not its own kind.

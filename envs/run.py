@@ -35,9 +35,9 @@ from purerl.envs.arenas import (
 )
 from purerl.envs.bodies import ANT, RODENT, Body
 from purerl.envs.compose import PREFIX, Composed, compose
+from purerl.envs.feeling import READINGS, felt, indices
 
 BODIES = {"ant": ANT, "rodent": RODENT}
-READINGS = ("xpos", "xmat", "subtree_com", "actuator_force")
 BODY_READINGS = ("cinert", "cvel")
 
 
@@ -217,21 +217,7 @@ class Run:
         With eyes: a dict of `policy` [O], `eyes` [E, H, W] uint8 and, in a corridor, `privileged`,
         which is what lies ahead.
         """
-        torso = self.parts.torso
-        to_body = readings.xmat[torso].T
-        ends = readings.xpos[jnp.array(self.parts.end_effectors)] - readings.xpos[torso]
-        parts = [
-            readings.xpos[torso, 2:],
-            readings.xmat[torso].ravel(),
-            physics.qpos[jnp.array(self.joints)],
-            to_body @ physics.qvel[:3],
-            physics.qvel[3:6],  # MuJoCo keeps a free joint's rotation in the body's own frame
-            physics.qvel[jnp.array(self.dofs)],
-            (ends @ to_body.T).ravel(),
-            readings.actuator_force,
-            physics.act,
-            action,
-        ]
+        parts = felt(self.parts, self.joints, self.dofs, physics, readings, action)
         if self.options.observe_place:
             parts.append(physics.qpos[:2])
         if self.options.observe_bodies:
@@ -336,7 +322,7 @@ def build(options: Options = Options(), engine: str = "auto") -> Run:  # noqa: B
     body = BODIES[options.body]
     parts = compose(body, build_arena(options, body), engine)
     model = parts.model
-    joints = [lookup.names(model, "joint")[i] for i in parts.joints]
+    joints, dofs = indices(parts)
     readings = READINGS + (BODY_READINGS if options.observe_bodies else ())
     readings += overflow_reading(engine)
     window = tuple(lookup.names(model, "geom")[i] for i in parts.boxes.boxes)
@@ -345,8 +331,8 @@ def build(options: Options = Options(), engine: str = "auto") -> Run:  # noqa: B
         options=options,
         physics=Physics(model, readings, options.substeps, engine),
         parts=parts,
-        joints=tuple(lookup.qpos_indices(model, joints).tolist()),
-        dofs=tuple(lookup.qvel_indices(model, joints).tolist()),
+        joints=joints,
+        dofs=dofs,
         action_size=model.nu,
         eyes=sight.build(parts.looks, eye, body.eye_distance, options.eyes, window),
     )

@@ -4,7 +4,7 @@ What belongs here: cameras on bodies, the shapes that rays meet, how light makes
 May import: core, ppo, physics. Read: `eye.py`, `eyes.py`, `casting.py`; then `networks.py`.
 """
 
-from purerl.eyes.eye import Eye as Eye, of_camera as of_camera, pair as pair
+from purerl.eyes.eye import Eye as Eye, of_camera as of_camera, pair as pair, rotation as rotation
 from purerl.eyes.eyes import Eyes as Eyes
 from purerl.eyes.networks import (
     Encoder as Encoder,

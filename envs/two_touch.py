@@ -1,0 +1,219 @@
+"""dm_control's two-touch: a rodent taps an orb, waits 0.8 s, and taps it again.
+
+What is right depends on when the first tap was, which nothing tells: the task needs a memory. The
+orb, its place, its state and its clock are data of the episode; after both taps it is elsewhere.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+
+from purerl import Array, Physics, PhysicsState, State, eyes as seeing, lookup
+from purerl.envs import sight
+from purerl.envs.arenas import TARGET, Floor
+from purerl.envs.bodies import RODENT
+from purerl.envs.compose import PREFIX, Composed, compose
+from purerl.envs.feeling import READINGS, felt, indices
+
+BEFORE, ONCE, TWICE, TOO_SOON, TOO_LATE = range(5)
+HEIGHT, AREA, RADIUS = 0.14, 1.5, 0.025  # of the orb: above the ground, +- from the middle [m]
+REWARD, NEAR = 25.0, 0.01  # for each right tap; the share of it that being near earns in a step
+INTERVAL, TOLERANCE, DEBOUNCE, TIMEOUT = 0.8, 0.1, 0.2, 1.2  # [s]
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Settings of the task."""
+
+    eyes: sight.Sight = sight.Sight(number=1)
+    """Without eyes it is told where the orb is."""
+    area: float = AREA
+    """The orb is within +- this of where the body starts, along x and y [m]."""
+    substeps: int = 5
+    """Physics steps in one control step."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TwoTouch:
+    """The environment; `build` makes one."""
+
+    options: Options
+    physics: Physics
+    parts: Composed
+    joints: tuple[int, ...]  # of qpos
+    dofs: tuple[int, ...]  # of qvel
+    hands: tuple[int, ...]  # body ids
+    palms: tuple[int, ...]  # geom ids, ellipsoids: what touches
+    action_size: int
+    eyes: seeing.Eyes | None
+
+    @property
+    def control_timestep(self) -> float:
+        """Simulated time of one step [s]."""
+        return self.physics.control_timestep
+
+    def reset(self, key: Array) -> State:
+        """Starts standing at the origin, turned anyhow."""
+        turn_key, orb_key, eyes_key, later_key = jax.random.split(key, 4)
+        half = jnp.pi * jax.random.uniform(turn_key)
+        rest = jnp.asarray(self.physics.model.qpos0, jnp.float32)
+        qpos = rest.at[3].set(jnp.cos(half)).at[6].set(jnp.sin(half))
+        physics, readings = self.physics.init(qpos, jnp.zeros(self.physics.model.nv))
+        task = {"key": later_key, "eyes": sight.draw(eyes_key, self.options.eyes)}
+        task |= {"orb": new_orb(orb_key, self.options.area), "right": jnp.zeros((), jnp.int32)}
+        # The readings are of before the orb was put there: what depends on it is read a step later.
+        physics = physics.replace(mocap_pos=task["orb"]["place"][None])
+        place = readings.xpos.at[lookup.find(self.physics.model, "body", TARGET)]
+        readings = readings._replace(xpos=place.set(task["orb"]["place"]))
+        action = jnp.zeros(self.action_size)
+        return self._state(physics, readings, task, jnp.zeros(()), action)
+
+    def step(self, state: State, action: Array) -> State:
+        """Drives the actuators with action [A] in [-1, 1]."""
+        task, orb = state.task, state.task["orb"]
+        next_key, draw_key = jax.random.split(task["key"])
+        moved = new_orb(draw_key, self.options.area)
+        orb = jax.tree.map(lambda new, old: jnp.where(orb["over"], new, old), moved, orb)
+        before = state.physics.replace(mocap_pos=orb["place"][None])
+        ctrl = lookup.scale_action(self.physics.model, action)
+        physics, readings = self.physics.step(before, ctrl)
+        touching = self._touching(readings, orb["place"])
+        orb, earned = tapped(orb, touching, physics.time)
+        right = task["right"] + (orb["logic"] == TWICE) * (state.task["orb"]["logic"] == ONCE)
+        task = task | {"key": next_key, "orb": orb, "right": right.astype(jnp.int32)}
+        return self._state(physics, readings, task, earned, action)
+
+    def _touching(self, readings: Any, place: Array) -> Array:
+        """Tells whether a palm touches the orb, [] bool."""
+        model, found = self.parts.looks, []
+        for geom in self.palms:
+            body = model.geom_bodyid[geom]
+            inner = readings.xmat[body].T @ (place - readings.xpos[body])
+            own = seeing.rotation(model.geom_quat[geom]).T @ (inner - model.geom_pos[geom])
+            found.append(distance_to_ellipsoid(own, model.geom_size[geom]) < RADIUS)
+        return jnp.stack(found).any()
+
+    def _state(
+        self, physics: PhysicsState, readings: Any, task: dict, earned: Array, action: Array
+    ) -> State:
+        place, logic = task["orb"]["place"], task["orb"]["logic"]
+        away = jnp.abs(readings.xpos[jnp.array(self.hands)] - place).sum(1)
+        near = NEAR * REWARD * jnp.exp(-3.0 * away).max()
+        torso = self.parts.torso
+        parts = felt(self.parts, self.joints, self.dofs, physics, readings, action)
+        parts.append(jax.nn.one_hot(logic, 5))  # dm_control tells it too, but not since when
+        where = readings.xmat[torso].T @ (place - readings.xpos[torso])
+        if self.eyes is None:
+            observation: Any = jnp.concatenate([*parts, where])
+        else:
+            sharp = self.eyes.see(readings.xpos, readings.xmat)
+            pictures = sight.spoil(sharp, task["eyes"], physics.time, self.options.eyes)
+            since = physics.time - jnp.maximum(task["orb"]["first"], 0.0)
+            told = jnp.append(where, jnp.where(logic == ONCE, since, 0.0))
+            observation = {"policy": jnp.concatenate(parts), "eyes": pictures, "privileged": told}
+        return State(
+            physics=physics,
+            observation=observation,
+            reward=near + earned,
+            terminated=jnp.zeros((), bool),
+            truncated=jnp.zeros((), bool),
+            metrics={"reward_near": near, "reward_tap": earned, "distance": away.min(),
+                     "taps_count": (earned > 0).astype(jnp.float32)},
+            task=task,
+        )  # fmt: skip
+
+
+def new_orb(key: Array, area: float) -> dict[str, Array]:
+    """Returns an orb that nobody has touched: where, what has happened, and when [s]."""
+    place = jax.random.uniform(key, (2,), minval=-area, maxval=area)
+    never, no = jnp.full((), -1.0, jnp.float32), jnp.zeros((), bool)
+    clock = {"touched": never, "first": never, "second": never}
+    return clock | {
+        "place": jnp.append(place, HEIGHT),
+        "logic": jnp.full((), BEFORE, jnp.int32),
+        "once": no,
+        "twice": no,
+        "waits": no,
+        "over": no,
+    }
+
+
+def tapped(orb: dict[str, Array], touching: Array, time: Array) -> tuple[dict[str, Array], Array]:
+    """Moves an orb on by a control step, and returns the reward for taps, [].
+
+    Args:
+      orb: of `new_orb`.
+      touching: [] bool: whether a palm touches it now.
+      time: [] of the episode [s].
+    """
+    once = orb["once"] | touching
+    touched = jnp.where(touching & ~orb["once"], time, orb["touched"])
+    twice = orb["twice"] | (touching & once & (time > touched + DEBOUNCE))
+    begins = (orb["logic"] == BEFORE) & once
+    waiting = orb["logic"] == ONCE
+    since = time - orb["first"]
+    ends, late = waiting & twice & ~orb["twice"], waiting & (since > INTERVAL + TOLERANCE)
+    soon = ends & (since < INTERVAL - TOLERANCE)
+    right = ends & ~soon & ~late
+    logic = jnp.where(begins, ONCE, orb["logic"])
+    logic = jnp.where(ends, jnp.where(soon, TOO_SOON, TWICE), logic)
+    logic = jnp.where(late, TOO_LATE, logic)
+    after = orb["logic"] > ONCE
+    orb = orb | {
+        "once": once,
+        "twice": twice,
+        "touched": touched,
+        "first": jnp.where(begins, time, orb["first"]),
+        "second": jnp.where(ends | late, time, orb["second"]),
+        "logic": logic.astype(jnp.int32),
+        "waits": jnp.where(soon | late, True, orb["waits"] & (time <= orb["second"] + TIMEOUT)),
+        "over": after & ~orb["waits"] & (time > orb["second"]),
+    }
+    return orb, REWARD * (begins | right).astype(jnp.float32)
+
+
+def distance_to_ellipsoid(point: Array, radii: Any) -> Array:
+    """Returns the distance of a point [3] from an ellipsoid's surface, [], 0 inside [m].
+
+    The nearest point is x r^2 / (r^2 + t), with the t for which it is on the surface: by bisection
+    (D. Eberly, "Distance from a point to an ellipse, an ellipsoid, or a hyperellipsoid", 2013).
+    """
+    square = jnp.square(jnp.asarray(radii, jnp.float32))
+
+    def outside(t: Array) -> Array:
+        return (square * jnp.square(point / (square + t))).sum() > 1.0
+
+    def halve(_, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = 0.5 * (low + high)
+        far = outside(middle)
+        return jnp.where(far, middle, low), jnp.where(far, high, middle)
+
+    most = jnp.sqrt(jnp.square(point).sum()) * jnp.sqrt(square.max())
+    low, _ = jax.lax.fori_loop(0, 40, halve, (jnp.zeros(()), most))
+    nearest = point * square / (square + low)
+    return jnp.where(outside(jnp.zeros(())), jnp.sqrt(jnp.square(point - nearest).sum()), 0.0)
+
+
+def build(options: Options = Options(), engine: str = "auto") -> TwoTouch:  # noqa: B008
+    """Builds the environment on an engine of `purerl.physics.interface`."""
+    parts = compose(RODENT, Floor(orb=RADIUS), engine)
+    joints, dofs = indices(parts)
+    hands = [lookup.find(parts.model, "body", f"{PREFIX}hand_{side}") for side in "LR"]
+    palms = [lookup.find(parts.looks, "geom", f"{PREFIX}hand_{side}_collision") for side in "LR"]
+    assert (parts.looks.geom_type[palms] == mujoco.mjtGeom.mjGEOM_ELLIPSOID).all()
+    eye = seeing.of_camera(parts.looks, PREFIX + RODENT.camera)
+    return TwoTouch(
+        options=options,
+        physics=Physics(parts.model, READINGS, options.substeps, engine),
+        parts=parts,
+        joints=joints,
+        dofs=dofs,
+        hands=tuple(hands),
+        palms=tuple(palms),
+        action_size=parts.model.nu,
+        eyes=sight.build(parts.looks, eye, RODENT.eye_distance, options.eyes, ()),
+    )

@@ -1,0 +1,146 @@
+"""Two-touch against dm_control's own logic, and what the eyes see of its orb."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from dm_control.locomotion.props.target_sphere import TargetSphereTwoTouch
+from dm_control.locomotion.tasks import reach
+
+from purerl.envs import sight, two_touch
+from purerl.envs.two_touch import distance_to_ellipsoid, new_orb, tapped
+
+DT = 0.021  # no number of steps is 0.2, 0.7, 0.9 or 1.2 s: there rounding would decide
+
+
+class Theirs:
+    """dm_control's task and orb, told at each step whether a hand touches; nothing is simulated."""
+
+    def __init__(self):
+        self.now, self.touching, self.hand = 0.0, False, np.zeros(3)
+        self.data = SimpleNamespace(contact=[])
+        orb = TargetSphereTwoTouch.__new__(TargetSphereTwoTouch)
+        orb.__dict__.update(
+            _geom="orb", _geom_id=7, _touch_debounce=0.2, _specific_collision_geom_ids={3},
+            _material=None, _texture_initial=None, _texture_interval=None, _texture_final=None,
+            _touched_once=False, _touched_twice=False,
+        )  # fmt: skip
+        self.orb, self.task = orb, reach.TwoTouch.__new__(reach.TwoTouch)
+        self.task.__dict__.update(
+            _aliveness_reward=0.0, _touch_interval=0.8, _interval_tolerance=0.1,
+            _failure_timeout=1.2, _reset_delay=0.0, _target_type_rewards=(25.0,),
+            _lhand_body="hand", _rhand_body="hand", _targets=[[orb]],
+        )  # fmt: skip
+        self.renew()
+
+    def renew(self):
+        self.orb._touched_once = self.orb._touched_twice = False
+        self.task.__dict__.update(
+            _state_logic=reach.TwoTouchState.PRE_TOUCH, _first_touch_time=None,
+            _second_touch_time=None, _do_time_out=False, _must_randomize_targets=False,
+            _target_rewarded_once=[[False]], _target_rewarded_twice=[[False]],
+        )  # fmt: skip
+
+    def time(self):
+        return self.now
+
+    def bind(self, what):
+        return SimpleNamespace(xpos=self.hand if what == "hand" else np.zeros(3), element_id=0)
+
+    def step(self, touching):
+        if self.task._must_randomize_targets:
+            self.renew()
+        self.now += DT
+        self.data.contact = [SimpleNamespace(geom1=3, geom2=7)] if touching else []
+        self.orb._update_activation(self)
+        return self.task.get_reward(self) - 0.25, int(self.task._state_logic)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.1, 0.4])
+def test_taps_are_judged_as_in_dm_control(share):
+    """3 s each: 4,000 steps of random taps."""
+    random, theirs = np.random.default_rng(0), Theirs()
+    orb, step, time = new_orb(jax.random.key(0), 1.5), jax.jit(tapped), np.float64(0.0)
+    held, outcomes = 0, set()
+    for _ in range(4000):
+        held = random.integers(1, 8) if held <= 0 and random.random() < share else held - 1
+        if orb["over"]:
+            orb = new_orb(jax.random.key(1), 1.5)
+        time += DT
+        orb, earned = step(orb, jnp.asarray(held > 0), jnp.float32(time))
+        assert (float(earned), int(orb["logic"])) == pytest.approx(theirs.step(held > 0))
+        outcomes.add(int(orb["logic"]))
+    assert outcomes >= {two_touch.BEFORE, two_touch.ONCE, two_touch.TOO_SOON, two_touch.TOO_LATE}
+
+
+def test_a_second_tap_at_the_right_time_is_worth_as_much():
+    orb, earned = new_orb(jax.random.key(0), 1.5), []
+    for number in range(1, 120):
+        orb, reward = tapped(orb, jnp.asarray(number in (5, 43)), jnp.float32(number * DT))
+        earned.append(float(reward))
+    assert earned[4] == earned[42] == 25.0 and sum(earned) == 50.0
+    assert bool(orb["over"]) and int(orb["logic"]) == two_touch.TWICE
+
+
+def test_distance_to_an_ellipsoid_is_mujocos():
+    """A sphere of the orb's size touches a palm where MuJoCo's own distance is below 0."""
+    radii = np.array([0.0065, 0.0037, 0.0022])
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><geom type="ellipsoid" size="{" ".join(map(str, radii))}"/>'
+        '<body mocap="true"><geom type="sphere" size="0.025"/></body></worldbody></mujoco>'
+    )
+    data, ours = mujoco.MjData(model), jax.jit(distance_to_ellipsoid)
+    for point in 0.02 * np.random.default_rng(0).normal(size=(200, 3)):
+        data.mocap_pos[0] = point
+        mujoco.mj_forward(model, data)
+        right = mujoco.mj_geomDistance(model, data, 0, 1, 1.0, None) + 0.025
+        if right > 2e-4:  # where the middle of the sphere is inside, MuJoCo's is another measure
+            assert abs(float(ours(jnp.float32(point), radii)) - right) < 1e-4
+    assert float(ours(jnp.zeros(3), radii)) == 0.0
+
+
+@pytest.fixture(scope="module")
+def env():
+    """15 s to build and to compile."""
+    made = two_touch.build(two_touch.Options(eyes=sight.Sight(number=1, size=24, reach=6.0)), "c")
+    return made, jax.jit(made.reset), jax.jit(made.step)
+
+
+@pytest.mark.slow
+def test_an_orb_before_the_eye_is_seen_and_a_palm_in_it_touches(env):
+    made, reset, step = env
+    state = reset(jax.random.key(0))
+    palm = made.palms[0]
+    body = made.parts.looks.geom_bodyid[palm]
+    data = mujoco.MjData(made.parts.model)
+    data.qpos[:] = state.physics.qpos
+    mujoco.mj_forward(made.parts.model, data)
+    pictures = {}
+    for name, place in {
+        "ahead": data.body("walker/skull").xpos + 0.2 * data.body("walker/torso").xmat[[0, 3, 6]],
+        "behind": data.body("walker/skull").xpos - 0.5 * data.body("walker/torso").xmat[[0, 3, 6]],
+        "in the hand": data.xpos[body],
+    }.items():
+        orb = state.task["orb"] | {"place": jnp.float32(place)}
+        after = step(state.replace(task=state.task | {"orb": orb}), jnp.zeros(made.action_size))
+        pictures[name] = np.asarray(after.observation["eyes"], int)
+        assert (float(after.metrics["taps_count"]) == 1.0) == (name == "in the hand")
+        near = np.exp(-3 * np.abs(data.xpos[list(made.hands)] - place).sum(1).min())
+        assert float(after.metrics["reward_near"]) == pytest.approx(0.25 * near, rel=0.2)
+    # White, as large as its size at its distance says: some 3% of the picture.
+    brighter = (np.abs(pictures["ahead"] - pictures["behind"]) > 20).mean()
+    assert 0.01 < brighter < 0.1
+
+
+@pytest.mark.slow
+def test_every_episode_has_an_orb_and_a_direction_of_its_own(env):
+    _, reset, _ = env
+    states = jax.vmap(reset)(jax.random.split(jax.random.key(1), 16))
+    place = np.asarray(states.task["orb"]["place"])
+    assert np.abs(place[:, :2]).max() <= 1.5 and place[:, :2].std() > 0.5
+    assert (place[:, 2] == np.float32(0.14)).all()
+    turn = np.arctan2(states.physics.qpos[:, 6], states.physics.qpos[:, 3])
+    assert turn.min() < 0.5 and turn.max() > 2.5
