@@ -129,6 +129,8 @@ def add_scenery(scene: mujoco.MjvScene, scenery: tuple[Array, ...]) -> None:
         geom, box = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_BOX
         color, upright = np.array([0.4, 0.45, 0.5, 1.0], np.float32), np.eye(3).ravel()
         mujoco.mjv_initGeom(geom, box, size, np.asarray(center, float), upright, color)
+        # MuJoCo leaves these as they were in memory, and draws nothing for some of their values.
+        geom.category, geom.transparent = int(mujoco.mjtCatBit.mjCAT_DECOR), 0
         scene.ngeom += 1
 
 

