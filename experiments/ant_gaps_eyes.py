@@ -1,4 +1,5 @@
-"""dm_control's ant runs along a corridor of gaps that it has to see: nothing tells it of edges.
+"""dm_control's ant runs along a corridor of gaps that nothing tells it of: it has to see.
+
 
 python -m purerl.run ant_gaps_eyes
 """
