@@ -81,9 +81,8 @@ def _probe(network: Network, params: PyTree, inputs: PyTree, memory: PyTree) -> 
     def weighted(params: PyTree, inputs: PyTree, which: tuple[int, ...]) -> Array:
         found = twice(params, inputs)[0]
         weights = [1.0 + jax.random.uniform(jax.random.key(i), found[i].shape) for i in which]
-        return sum(
-            (jnp.sum(w * found[i]) for w, i in zip(weights, which, strict=True)), jnp.zeros(())
-        )
+        parts = [jnp.vdot(w, found[i]) for w, i in zip(weights, which, strict=True)]
+        return jnp.sum(jnp.stack(parts))
 
     by_inputs = jax.grad(weighted, argnums=1)
     of_value, of_policy = (by_inputs(params, inputs, which) for which in ((2,), (0, 1)))

@@ -200,9 +200,8 @@ def check_changes(physics: Any, begun: Begun) -> Iterator[Finding]:
             except ValueError as wrong:
                 yield error("changes", f"of {call}: {wrong}")
                 return
-    differ: dict[str, set[str]] = {call: set() for call in found}
-    for call, changes in found.items():
-        for name, value in changes.items():
+    for call, other in (("init", "step"), ("step", "init")):
+        for name, value in found[call].items():
             rows = (value != np.float32(getattr(own, name))).any(0)
             rows = rows.reshape(len(rows), -1).any(1)
             if name in ("body_pos", "body_quat"):
@@ -210,10 +209,7 @@ def check_changes(physics: Any, begun: Begun) -> Iterator[Finding]:
             if (rows & idle_rows(own, physics.engine, name)).any():
                 what = f"changes[{name!r}] differs from the model in rows that nothing heeds"
                 yield warning("changes", f"{what}: {np.flatnonzero(rows)[:6].tolist()}.")
-            differ[call] |= {name} if rows.any() else set()
-    for call, other in (("init", "step"), ("step", "init")):
-        for name in differ[call] - set(found[other]):
-            what = (
-                f"changes[{name!r}] is given to {call} and not to {other}, which takes the model's"
-            )
-            yield warning("changes", f"{what} own: give each call all of them.")
+            if rows.any() and name not in found[other]:
+                what = f"changes[{name!r}] is given to {call} and not to {other}"
+                cure = "which takes the model's own: give each call all of them."
+                yield warning("changes", f"{what}, {cure}")

@@ -15,34 +15,27 @@ from purerl.core.errors import unknown_name
 from purerl.core.records import Array
 from purerl.physics.left_out import LEFT_OUT
 
-# Fields of MjModel that may differ between environments, on every engine: a test compares them with
-# those that MJX traces, so that the `c` engine need not import MJX, which takes seconds.
+# Floats of MjModel that are of no one simulation (of meshes, of users), or that MJX does not trace.
+_ONE_FOR_ALL = re.compile(
+    "(bvh|efm0|flex|flexedge|hfield|key|mesh|numeric|oct|sensor|skin|tuple|wrap)_.*|.*_user|"
+    "actuator_(armature|damping|dampingpoly|delay|length0)|body_margin|cam_(ipd|sensorsize)|"
+    "dof_length|geom_(adhesion|fluid|surfacevel)|light_(bulbradius|intensity|range|softness)|"
+    "mat_(metallic|reflectance|roughness|texrepeat)|pair_adhesion|site_(rgba|size)|"
+    "tendon_(rgba|width)"
+)
+_NO_MODEL = mujoco.MjModel.from_xml_string("<mujoco/>")
+# Fields that may differ between environments, on every engine: a test compares them with those that
+# MJX traces, so that the `c` engine need not import MJX, which takes seconds.
 CHANGEABLE_FIELDS = tuple(
-    """
-    actuator_acc0 actuator_actrange actuator_biasprm actuator_cranklength actuator_ctrlrange
-    actuator_dynprm actuator_forcerange actuator_gainprm actuator_gear actuator_lengthrange
-    body_gravcomp body_inertia body_invweight0 body_ipos body_iquat body_mass body_pos body_quat
-    body_subtreemass cam_fovy cam_intrinsic cam_mat0 cam_pos cam_pos0 cam_poscom0 cam_quat dof_M0
-    dof_armature dof_damping dof_dampingpoly dof_frictionloss dof_invweight0 dof_solimp dof_solref
-    eq_data eq_solimp eq_solref geom_aabb geom_friction geom_gap geom_margin geom_pos geom_quat
-    geom_rbound geom_rgba geom_size geom_solimp geom_solmix geom_solref jnt_actfrcrange jnt_axis
-    jnt_margin jnt_pos jnt_range jnt_solimp jnt_solref jnt_stiffness jnt_stiffnesspoly
-    light_ambient light_attenuation light_cutoff light_diffuse light_dir light_dir0 light_exponent
-    light_pos light_pos0 light_poscom0 light_specular mat_emission mat_rgba mat_shininess
-    mat_specular pair_friction pair_gap pair_margin pair_solimp pair_solref pair_solreffriction
-    qpos0 qpos_spring site_pos site_quat tendon_actfrcrange tendon_armature tendon_damping
-    tendon_dampingpoly tendon_frictionloss tendon_invweight0 tendon_length0 tendon_lengthspring
-    tendon_margin tendon_range tendon_solimp_fri tendon_solimp_lim tendon_solref_fri
-    tendon_solref_lim tendon_stiffness tendon_stiffnesspoly
-    """.split()  # noqa: SIM905
+    name
+    for name in dir(_NO_MODEL)
+    if getattr(getattr(_NO_MODEL, name), "dtype", int) in (np.float32, np.float64)
+    and not _ONE_FOR_ALL.fullmatch(name)
 )
 
 # Those of them that mj_setConst derives from others, and those that the compiler alone does.
-CONSTANTS = """
-body_subtreemass body_invweight0 dof_invweight0 dof_M0 tendon_length0 tendon_invweight0
-actuator_acc0 eq_data geom_rbound geom_aabb cam_pos0 cam_poscom0 cam_mat0 light_pos0 light_poscom0
-light_dir0
-""".split()  # noqa: SIM905
+_DERIVED = {*mujoco.MjModel._setconst_outputs} - {"geom_size"}
+CONSTANTS = [name for name in CHANGEABLE_FIELDS if name in _DERIVED]
 _COMPILED = ("tendon_lengthspring", "actuator_lengthrange")
 # Ends of names, and of the field without which those do nothing: jnt_range, jnt_limited.
 _SWITCHES = {r"(range|margin|solref|solimp)(_lim)?$": "limited", r"(dyn|bias)prm$": r"\1type"}

@@ -19,7 +19,7 @@ from mujoco.batch import Batch, SimulationError
 
 from purerl.core.records import Array, PyTree
 from purerl.physics import host_calls, reasons
-from purerl.physics.lookup import hash_model
+from purerl.physics.lookup import hash_model, reading_shapes
 
 _BLOWN_UP = [
     int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{x}")) for x in ("QPOS", "QVEL", "QACC", "CTRL")
@@ -45,8 +45,7 @@ class CEngine:
         self.stage, self.substeps = stage, substeps
         # All that results depend on, but what is asked of a call.
         self.name = f"purerl-{hash_model(self.model, (*record._fields, stage))}"
-        data = mujoco.MjData(model)
-        self.shapes = [np.shape(getattr(data, name, 0.0)) for name in record._fields]
+        self.shapes = list(reading_shapes(model, record._fields).values())
         self.rows: dict[tuple, Rows] = {}  # by number, fields and changed fields
         # XLA may run the callbacks of independent programs on several threads at once.
         self.lock = threading.Lock()
@@ -71,7 +70,7 @@ class CEngine:
         shapes = [leaf.shape for leaf in leaves] + self.shapes
         out = host_calls.run(name, host, given, shapes)
         state = jax.tree.unflatten(structure, out[: len(leaves)])
-        return state, self.record(*map(_as_matrix, self.record._fields, out[len(leaves) :]))
+        return state, self.record(*out[len(leaves) :])
 
     def rows_of(self, number: int, fields: tuple[str, ...], names: tuple[str, ...]) -> "Rows":
         """Returns the simulations of `number` environments, and where their packed rows go."""
@@ -106,11 +105,6 @@ def _movable(model: mujoco.MjModel, names: tuple[str, ...]) -> mujoco.MjModel:
     model.geom_sameframe[:] = model.site_sameframe[:] = model.body_sameframe[:] = 0
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
     return model
-
-
-def _as_matrix(name: str, value: Array) -> Array:
-    """Rotation matrices are [n, 3, 3], as on the other engines; MuJoCo keeps rows of 9."""
-    return value.reshape(-1, 3, 3) if name.endswith("mat") else value
 
 
 def _run_rows(

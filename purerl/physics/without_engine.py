@@ -5,23 +5,20 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
-import numpy as np
 
 from purerl.core.env import Env
 from purerl.core.records import Array, PyTree
 from purerl.physics.interface import Physics
+from purerl.physics.lookup import reading_shapes
 
 
 class NoEngine:
     """In the place of an engine: results of the right shapes, which follow from all it is given."""
 
     def __init__(self, physics: Physics) -> None:
-        """Asks MuJoCo for the readings' shapes; engine `warp` has one more, "overflow" []."""
-        data, self.record = mujoco.MjData(physics.model), physics._engine.record
-        shapes = {name: np.shape(getattr(data, name, 0.0)) for name in self.record._fields}
-        # As on all engines, matrices are [n, 3, 3].
-        self.shapes = [(s[0], 3, 3) if name.endswith("mat") else s for name, s in shapes.items()]
+        """Asks MuJoCo for the readings' shapes."""
+        self.record = physics._engine.record
+        self.shapes = reading_shapes(physics.model, self.record._fields).values()
 
     def init(self, state: PyTree, changes: dict[str, Array], ctrl: Array | None = None) -> tuple:
         """Returns readings."""
