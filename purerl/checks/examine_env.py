@@ -7,12 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from purerl.checks import check_env
-from purerl.checks.check_traces import check_traces
-from purerl.checks.examine_model import check_model
+from purerl.checks import check_env, check_traces, examine_model, watch_physics
 from purerl.checks.findings import Finding, error, ok, some, warning
 from purerl.checks.user_code import in_words, own_line, program_errors
-from purerl.checks.watch_physics import check_controls, check_placed
 from purerl.core.env import ABSURD, Env, EnvError, State
 from purerl.core.errors import one_line
 from purerl.machine.state_arrays import flatten
@@ -47,15 +44,15 @@ def examine(env: Env, num_steps: int = NUM_STEPS) -> Iterator[Finding]:
     yield from check_trial(trial)
     if reason := reasons.most():
         yield warning("mujoco", reason)
-    yield from check_controls(env, trial)
-    yield from check_placed(env)
-    yield from check_model(env, trial)
+    yield from watch_physics.check_controls(env, trial)
+    yield from watch_physics.check_placed(env)
+    yield from examine_model.check_model(env, trial)
 
 
 def check_repeats(env: Env, trial: check_env.Trial) -> Finding:
     """Tells whether the environment does the same twice: in one program, and in two."""
     checks = (
-        (check_traces, env),
+        (check_traces.check_traces, env),
         (check_env.check_keys_repeat, trial),
         (check_env.check_steps_repeat, trial),
     )

@@ -8,9 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from purerl.checks.check_env import Trial
+from purerl.checks import check_env, watch_physics
 from purerl.checks.findings import Finding, ok, warning
-from purerl.checks.watch_physics import watching
 from purerl.core.env import Env, State
 from purerl.core.records import Array
 
@@ -20,7 +19,7 @@ LARGE = 4 * np.pi  # one that was written in degrees, and read as radians
 SLIDE, NEWTON = 2, 2  # of mujoco.mjtJoint and mjtSolver
 
 
-def check_model(env: Env, trial: Trial) -> Iterator[Finding]:
+def check_model(env: Env, trial: check_env.Trial) -> Iterator[Finding]:
     """Yields what is found of the model of `env.physics`; nothing where there is none."""
     physics: Any = getattr(env, "physics", None)
     if hasattr(physics, "substeps"):
@@ -45,12 +44,12 @@ def check_ranges(model: Any) -> Iterator[Finding]:
             yield warning("ranges", f"{what}, and {odd.sum()} ranges look like that: {cure}.")
 
 
-def check_solver(env: Env, physics: Any, trial: Trial) -> Iterator[Finding]:
+def check_solver(env: Env, physics: Any, trial: check_env.Trial) -> Iterator[Finding]:
     """Compares control steps with those of a solver of many more iterations, both of MuJoCo's C."""
     from purerl.physics.interface import Physics
 
     def given(state: State, action: Array) -> tuple[Any, Any]:
-        with watching(physics) as seen:
+        with watch_physics.watching(physics) as seen:
             env.step(state, action)
         return seen.calls[0]
 

@@ -24,7 +24,6 @@ from purerl.core.records import Array, Metrics, Network, PyTree, TrainState
 from purerl.devices.compilation import Compiling, portable, shapes, start, unordered
 from purerl.devices.shards import AXIS, Shards, improve
 from purerl.ppo import algorithm
-from purerl.ppo.algorithm import Experience
 from purerl.ppo.config import Config
 
 # Fields of TrainState that are [B, ...].
@@ -147,7 +146,7 @@ def fetch(layout: Layout, state: Spread) -> TrainState:
 
 def collect(
     config: Config, env: Env, network: Network, learned: TrainState, places: dict[str, PyTree]
-) -> tuple[dict[str, PyTree], Experience]:
+) -> tuple[dict[str, PyTree], algorithm.Experience]:
     """Moves one shard on; returns its places and, as one part [1, ...], what it saw."""
     state, experience = algorithm.collect(config, env, network, learned.replace(**places))
     return {name: getattr(state, name) for name in PLACES}, experience

@@ -21,8 +21,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.extend import core
 
-from purerl.exact import fused_loops, fused_solves, pallas_calls, walk
-from purerl.exact.constants import is_known
+from purerl.exact import constants, fused_loops, fused_solves, pallas_calls, walk
 from purerl.exact.scatters import gathered_scatter, puts
 from purerl.exact.traces import equations, has_loop, with_own_derivative
 from purerl.exact.walk import Inside, Rule
@@ -131,7 +130,7 @@ def _rounds(params: dict, inputs: Sequence) -> int | None:
     made_by = {v: e for e in body.eqns for v in e.outvars}
     for atom, limit in _limits(test):
         place = test.invars.index(atom) - n if atom in test.invars else -1
-        if place < 0 or not is_known(starts[place]):
+        if place < 0 or not constants.is_known(starts[place]):
             continue
         step = made_by.get(body.outvars[place])
         if step and step.primitive.name == "add" and step.invars[0] is counters[place]:

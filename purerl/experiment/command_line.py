@@ -17,8 +17,7 @@ from purerl.experiment import other_trainers, settings_json
 from purerl.experiment.definition import Experiment, shrunk
 from purerl.experiment.loading import Source, available, find_source, summary
 from purerl.experiment.options import RunOptions
-from purerl.machine import output
-from purerl.machine.command_errors import tell
+from purerl.machine import command_errors, output
 
 CONFIG = (tyro.conf.FlagCreatePairsOff,)
 # A flag takes a word, True or False, as every other option does.
@@ -63,7 +62,7 @@ def _main(run: Callable[[list[str]], int | None]) -> Callable[..., int]:
         try:
             return run(sys.argv[1:] if arguments is None else list(arguments)) or SUCCESS
         except (UserError, RunError, StoppedError) as error:
-            return tell(error)
+            return command_errors.tell(error)
 
     return main
 

@@ -8,15 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from purerl.checks.check_env import check_fields, check_members, check_shapes, shapes_of_reset
-from purerl.checks.check_traces import difference, trace_anew
+from purerl.checks import check_env, check_traces
 from purerl.checks.user_code import check_takes, users_errors
 from purerl.core.env import Env, EnvError
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.records import Network, PolicyOutput, PyTree
-from purerl.devices import memory, threads
+from purerl.devices import memory, programs, threads
 from purerl.devices.check_sizes import check_minibatches
-from purerl.devices.programs import abstract_state
 from purerl.experiment import settings_json
 from purerl.experiment.definition import Experiment
 from purerl.experiment.kinds import wrong_value
@@ -52,10 +50,10 @@ def build(chosen: Experiment) -> Setup:
         raise UserError("build_env returned None: its last line must return the environment.")
     about = f"The environment {type(env).__name__}: "
     with users_errors(""):
-        check_members(env)
+        check_env.check_members(env)
     with users_errors(about):
-        state = shapes_of_reset(env)
-        check_fields(state)
+        state = check_env.shapes_of_reset(env)
+        check_env.check_fields(state)
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state.observation)
     with users_errors("build_network: "):
         network = chosen.build_network(chosen.network, zeros, env.action_size)
@@ -64,7 +62,7 @@ def build(chosen: Experiment) -> Setup:
     setup = Setup(chosen.ppo, env, in_float32(network), engine)
     with users_errors(""), naming_broken_rules(env):
         # Sizes that do not fit together show here, in a second.
-        abstract = abstract_state(*setup[:3])
+        abstract = programs.abstract_state(*setup[:3])
         check_minibatches(setup.config, is_recurrent(abstract.memory), setup.config.num_envs)
     return setup
 
@@ -87,7 +85,7 @@ def check_acts(chosen: Experiment, before: dict[str, Any], env: Env, abstract: P
     def trace(settings: Any) -> Any:
         options = settings_json.from_json(chosen.network, settings)
         network = chosen.build_network(options, example, env.action_size)
-        return trace_anew(network.apply, abstract.params, seen, abstract.memory)
+        return check_traces.trace_anew(network.apply, abstract.params, seen, abstract.memory)
 
     now, old = settings_json.to_json(chosen.network), before["network"]
     idle = ["seed"] * (before["seed"] != chosen.seed)
@@ -96,7 +94,7 @@ def check_acts(chosen: Experiment, before: dict[str, Any], env: Env, abstract: P
     for name in now if isinstance(now, dict) and isinstance(old, dict) else ():
         if old.get(name, now[name]) != now[name]:
             with contextlib.suppress(Exception):  # the code of today refuses what was: it acts
-                if difference(trace(now | {name: old[name]}), trace(now)) is None:
+                if check_traces.difference(trace(now | {name: old[name]}), trace(now)) is None:
                     idle.append(f"network.{name}")
     if idle:
         raise UserError(
@@ -223,7 +221,7 @@ def naming_broken_rules(env: Env) -> Iterator[None]:
         raise
     except Exception as error:
         try:
-            check_shapes(env)
+            check_env.check_shapes(env)
         except EnvError as broken:
             what = one_line(broken)
             raise UserError(f"The environment {type(env).__name__}: {what}") from error

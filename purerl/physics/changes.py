@@ -34,8 +34,8 @@ CHANGEABLE_FIELDS = tuple(
 )
 
 # Those of them that mj_setConst derives from others, and those that the compiler alone does.
-_DERIVED = {*mujoco.MjModel._setconst_outputs} - {"geom_size"}
-CONSTANTS = [name for name in CHANGEABLE_FIELDS if name in _DERIVED]
+_DERIVED = [name for name in mujoco.MjModel._setconst_outputs if name != "geom_size"]
+CONSTANTS = [name for name in _DERIVED if name in CHANGEABLE_FIELDS]
 _COMPILED = ("tendon_lengthspring", "actuator_lengthrange")
 # Ends of names, and of the field without which those do nothing: jnt_range, jnt_limited.
 _SWITCHES = {r"(range|margin|solref|solimp)(_lim)?$": "limited", r"(dyn|bias)prm$": r"\1type"}

@@ -10,8 +10,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from purerl.core.records import Array
-from purerl.physics import host_calls, reasons
-from purerl.physics.lookup import hash_model
+from purerl.physics import host_calls, lookup, reasons
 
 
 def derive(
@@ -19,7 +18,7 @@ def derive(
 ) -> dict[str, Array]:
     """Returns the `wanted` constants of a model with changes: by mj_setConst, on the host."""
     names = tuple(sorted(changes))
-    name = "-".join(["purerl-derive", hash_model(model, wanted), *names])
+    name = "-".join(["purerl-derive", lookup.hash_model(model, wanted), *names])
     host = functools.partial(_derive_rows, copy.copy(model), names, wanted)
     shapes = [getattr(model, n).shape for n in wanted]
     found = host_calls.run(name, host, [changes[n] for n in names], shapes)

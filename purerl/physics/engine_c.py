@@ -18,8 +18,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from purerl.core.records import Array, PyTree
-from purerl.physics import host_calls, reasons
-from purerl.physics.lookup import hash_model, reading_shapes
+from purerl.physics import host_calls, lookup, reasons
 
 _BLOWN_UP = [
     int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{x}")) for x in ("QPOS", "QVEL", "QACC", "CTRL")
@@ -44,8 +43,8 @@ class CEngine:
         self.model, self.record = copy.copy(model), record
         self.stage, self.substeps = stage, substeps
         # All that results depend on, but what is asked of a call.
-        self.name = f"purerl-{hash_model(self.model, (*record._fields, stage))}"
-        self.shapes = list(reading_shapes(model, record._fields).values())
+        self.name = f"purerl-{lookup.hash_model(self.model, (*record._fields, stage))}"
+        self.shapes = list(lookup.reading_shapes(model, record._fields).values())
         self.rows: dict[tuple, Rows] = {}  # by number, fields and changed fields
         # XLA may run the callbacks of independent programs on several threads at once.
         self.lock = threading.Lock()

@@ -8,17 +8,16 @@ import jax.numpy as jnp
 
 from purerl.core.env import Env
 from purerl.core.records import Array, PyTree
-from purerl.physics.interface import Physics
-from purerl.physics.lookup import reading_shapes
+from purerl.physics import interface, lookup
 
 
 class NoEngine:
     """In the place of an engine: results of the right shapes, which follow from all it is given."""
 
-    def __init__(self, physics: Physics) -> None:
+    def __init__(self, physics: interface.Physics) -> None:
         """Asks MuJoCo for the readings' shapes."""
         self.record = physics._engine.record
-        self.shapes = reading_shapes(physics.model, self.record._fields).values()
+        self.shapes = lookup.reading_shapes(physics.model, self.record._fields).values()
 
     def init(self, state: PyTree, changes: dict[str, Array], ctrl: Array | None = None) -> tuple:
         """Returns readings."""
@@ -38,7 +37,7 @@ def without_engine(env: Env) -> Env:
     environment holds under another name, or as a property, computes as ever.
     """
     held: Any = getattr(env, "__dict__", {})
-    if not isinstance(held.get("physics"), Physics):
+    if not isinstance(held.get("physics"), interface.Physics):
         return env
     found: Any = copy.copy(env)
     found.__dict__["physics"] = still = copy.copy(held["physics"])

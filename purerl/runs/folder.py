@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import UserError
-from purerl.machine import files
-from purerl.machine.lock import LOCK
+from purerl.machine import files, lock
 from purerl.runs import checkpoint_folder
 from purerl.runs.identity import fingerprint
 
 CONFIG, MANIFEST, CODE = "config.json", "manifest.json", "experiment.py"
 METRICS, CHECKPOINTS = "metrics.jsonl", "checkpoints"
-OURS = {LOCK, CONFIG, MANIFEST, CODE, METRICS, CHECKPOINTS}
+OURS = {lock.LOCK, CONFIG, MANIFEST, CODE, METRICS, CHECKPOINTS}
 
 
 class Folder(NamedTuple):

@@ -14,11 +14,9 @@ from pathlib import Path
 
 from purerl.core.errors import UserError, one_line
 from purerl.experiment.source_hashes import IMPORTED, PACKAGE
-from purerl.machine.file_reads import reads_among
-from purerl.machine.output import show
-from purerl.runs import checkpoint_folder
+from purerl.machine import file_reads, output
+from purerl.runs import checkpoint_folder, restored_run
 from purerl.runs.folder import CODE, CONFIG, MANIFEST, check_manifest, read_run, runs_in
-from purerl.runs.restored_run import restore
 
 
 def pack(run: Path, trust: bool) -> dict[Path, bytes]:
@@ -33,8 +31,8 @@ def pack(run: Path, trust: bool) -> dict[Path, bytes]:
     here = Path.cwd()
     # Neither hidden files nor Python's compiled ones.
     seen = [here / name for name in glob.iglob("**", root_dir=here, recursive=True)]
-    with reads_among(file for file in seen if file.is_file()) as read:
-        restored = restore(run.absolute(), "latest", show, trust=trust)
+    with file_reads.reads_among(file for file in seen if file.is_file()) as read:
+        restored = restored_run.restore(run.absolute(), "latest", output.show, trust=trust)
     folder, facts = restored.folder, restored.folder.manifest
     # Of an empty file nothing is read.
     read |= {*seen} & {place / "__init__.py" for file in read for place in file.parents}

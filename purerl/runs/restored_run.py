@@ -4,17 +4,12 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from purerl.checks.held_arrays import hash_held
-from purerl.checks.user_code import own_line
+from purerl.checks import held_arrays, user_code
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.records import TrainState
-from purerl.devices import memory
-from purerl.devices.programs import abstract_state
-from purerl.experiment import settings_json
-from purerl.experiment.definition import Experiment
-from purerl.experiment.loading import Source
+from purerl.devices import memory, programs
+from purerl.experiment import definition, loading, settings_json, source_hashes
 from purerl.experiment.objects import Setup, build, physics_hash
-from purerl.experiment.source_hashes import module_file, source_hashes
 from purerl.experiment.trust import load_copy
 from purerl.machine.output import Say
 from purerl.runs import checkpoint, checkpoint_folder, identity
@@ -25,10 +20,10 @@ from purerl.runs.resume import edited
 class RestoredRun(NamedTuple):
     """A run read back from its folder alone."""
 
-    experiment: Experiment
+    experiment: definition.Experiment
     setup: Setup
     saved: checkpoint.Saved
-    source: Source  # the experiment as its file has it
+    source: loading.Source  # the experiment as its file has it
     folder: Folder
 
 
@@ -60,7 +55,7 @@ def restore(
     except (UserError, RunError):
         raise
     except Exception as error:  # of code that trained: it, or its settings, is another since
-        what = f"{one_line(error)}{own_line(error)}"
+        what = f"{one_line(error)}{user_code.own_line(error)}"
         raise UserError(f"{folder} cannot be built with its {CONFIG}: {what}") from error
     for what in _changed_since(begun, source, setup):
         say(f"{folder}: {what} is not that of the run any more.")
@@ -75,7 +70,7 @@ def read_checkpoint(folder: Path, update: str, setup: Setup, say: Say) -> checkp
 
 
 def _read_checkpoint(run: Folder, update: str, setup: Setup, say: Say) -> checkpoint.Saved:
-    abstract = abstract_state(*setup[:3])
+    abstract = programs.abstract_state(*setup[:3])
     abstract = abstract.replace(env_state=None, episode=None, optimizer=None)
     _check_memory(run.path, memory.size(abstract))
     return _choose(run, update, abstract, say)
@@ -90,19 +85,19 @@ def _check_memory(folder: Path, size: int) -> None:
         )
 
 
-def _changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[str]:
+def _changed_since(begun: dict[str, Any], source: loading.Source, setup: Setup) -> list[str]:
     """Lists what has changed since the run began and may change what its policy does."""
     builders = (source.experiment.build_env, source.experiment.build_network)
-    now, then = source_hashes(builders), begun["source"]
+    now, then = source_hashes.source_hashes(builders), begun["source"]
     edited = [name for name, value in now.items() if then.get(name) != value]
     # The run's own copy of its experiment, `source`, cannot have been edited.
-    edited = [name for name in edited if module_file(name) != source.path]
+    edited = [name for name in edited if source_hashes.module_file(name) != source.path]
     few = ", ".join(edited[:3]) + (f" and {len(edited) - 3} more" if len(edited) > 3 else "")
     found = [f"The code of {few}"] if edited else []
     if setup.engine == begun["engine"] and physics_hash(setup.env) != begun["model"]:
         found.append("MuJoCo's model")
     held = begun.get("arrays")  # of older runs there is none
-    if not edited and held and held != hash_held(setup.env, setup.network):
+    if not edited and held and held != held_arrays.hash_held(setup.env, setup.network):
         found.append("The data that the environment or the network holds")
     return found
 

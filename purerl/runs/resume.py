@@ -9,11 +9,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import UserError
-from purerl.experiment import settings_json
+from purerl.experiment import options, settings_json, source_hashes
 from purerl.experiment.definition import Experiment
 from purerl.experiment.loading import Source
-from purerl.experiment.options import Resume
-from purerl.experiment.source_hashes import hash_code
 from purerl.machine.files import draft_of
 from purerl.ppo.config import Config
 from purerl.runs import folder as run_folder, manifest
@@ -34,7 +32,7 @@ class Description(NamedTuple):
 
 
 def check_new_or_resume(
-    folders: Sequence[Folder], experiments: Sequence[Experiment], resume: Resume
+    folders: Sequence[Folder], experiments: Sequence[Experiment], resume: options.Resume
 ) -> None:
     """Raises UserError if a new run would overwrite something, or there is nothing to resume.
 
@@ -50,7 +48,7 @@ def check_new_or_resume(
         _check_usable(folder, chosen, resume)
 
 
-def _check_usable(folder: Folder, chosen: Experiment, resume: Resume) -> None:
+def _check_usable(folder: Folder, chosen: Experiment, resume: options.Resume) -> None:
     """Raises UserError if one folder may not be written."""
     run_folder.check_no_links(folder)
     if folder.is_begun and not resume:
@@ -128,7 +126,7 @@ def changes(folder: Folder, now: Description) -> list[str]:
     """Returns in what this process would not continue the run exactly, a line each."""
     found = manifest.differences(folder.config, now.config)
     found += manifest.differences(check_manifest(folder), now.manifest)
-    if hash_code(folder.code) != hash_code(now.source.text):
+    if source_hashes.hash_code(folder.code) != source_hashes.hash_code(now.source.text):
         found.append(f"{CODE}: {now.source.path} has been edited")
     return found + edited(folder)
 

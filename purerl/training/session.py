@@ -15,25 +15,21 @@ from purerl import exact
 from purerl.checks.held_arrays import hash_held
 from purerl.core.errors import UserError
 from purerl.core.records import PyTree
-from purerl.devices import compilation, processes
+from purerl.devices import compilation, processes, programs
 from purerl.devices.check_sizes import check_minibatches, check_shards
 from purerl.devices.processes import in_first_process, kept_by_first
-from purerl.devices.programs import abstract_state
 from purerl.devices.shards import Shards
 from purerl.experiment import objects
 from purerl.experiment.definition import Experiment
 from purerl.experiment.loading import Source
-from purerl.experiment.objects import Setup
 from purerl.experiment.options import RunOptions
-from purerl.machine import output
-from purerl.machine.files import disk_errors
+from purerl.machine import files, output
 from purerl.machine.lock import FolderLock
 from purerl.ppo.config import Config
 from purerl.ppo.learner import is_recurrent
 from purerl.runs import checkpoint, folder as run_folder, manifest, resume
 from purerl.runs.folder import Folder, check_manifest
-from purerl.training import console
-from purerl.training.loggers import check_loggers
+from purerl.training import console, loggers
 from purerl.training.plan import make_plan
 from purerl.training.seeds import Job, Seed, train_all
 
@@ -60,7 +56,7 @@ def execute(
         processes.start(options.distributed)
         experiments = list(runs.values())
         in_first_process(lambda: resume.check_new_or_resume(found, experiments, options.resume))
-        check_loggers(options)
+        loggers.check_loggers(options)
         cache = compilation.set_up_jax(options.cache)
         job = prepare(source, experiments[0], found, options, stop)._replace(listener=listener)
         seeds = begin(source, runs, job, cache, stack)
@@ -77,7 +73,7 @@ def prepare(
     """Builds the experiment's objects, and says how they will be trained; arguments as above."""
     with compilation.no_collection():
         setup = objects.build(chosen)
-        abstract = abstract_state(*setup[:3])
+        abstract = programs.abstract_state(*setup[:3])
     begun_with = in_first_process(lambda: _shards_begun_with(found))
     shards = _choose_shards(setup.config, abstract, options, begun_with)
     objects.check_memory(setup, abstract, options.vmapped_seeds, shards.devices)
@@ -116,7 +112,7 @@ def _choose_shards(
 
 
 def _facts(
-    source: Source, chosen: Experiment, options: RunOptions, setup: Setup, shards: Shards
+    source: Source, chosen: Experiment, options: RunOptions, setup: objects.Setup, shards: Shards
 ) -> dict[str, Any]:
     """Returns what manifest.json says of a run that begins now."""
     builders = (chosen.build_env, chosen.build_network)
@@ -145,7 +141,7 @@ def begin(
       stack: gives the locks back at its end.
     """
 
-    @disk_errors()
+    @files.disk_errors()
     def locked() -> list[Seed]:
         locks = []
         for path in runs:

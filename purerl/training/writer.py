@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import RunError, UserError, one_line
-from purerl.machine.files import make_folder
+from purerl.machine import files, output
 from purerl.machine.lock import FolderLock
-from purerl.machine.output import Say
 from purerl.machine.state_arrays import Leaves, digest_leaves
 from purerl.runs import checkpoint, checkpoint_folder
 from purerl.runs.folder import Folder, note
@@ -32,7 +31,7 @@ class RunWriter:
         metrics: MetricsFile,
         lock: FolderLock,
         keep: int,
-        say: Say,
+        say: output.Say,
         worker: ThreadPoolExecutor,
         together: Sequence[Path],
     ) -> None:
@@ -50,7 +49,7 @@ class RunWriter:
             They keep the checkpoints that all of them have.
         """
         self.folder, self.checkpoints = folder, folder.checkpoints
-        make_folder(self.checkpoints)
+        files.make_folder(self.checkpoints)
         checkpoint_folder.clean(self.checkpoints)
         self.lock, self.metrics = lock, metrics
         self.signature = {name: folder.manifest[name] for name in ("run_id", "fingerprint")}

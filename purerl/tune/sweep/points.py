@@ -10,11 +10,8 @@ from typing import Annotated, Any, NamedTuple
 import tyro
 
 from purerl.core.errors import UserError, one_line
-from purerl.experiment import other_trainers, settings_json
+from purerl.experiment import definition, kinds, loading, other_trainers, settings_json
 from purerl.experiment.command_line import WORDS, parse
-from purerl.experiment.definition import Experiment
-from purerl.experiment.kinds import hints
-from purerl.experiment.loading import Source
 from purerl.experiment.options import RunOptions
 from purerl.tune.option_numbers import Place, replaced
 from purerl.tune.sweep.scheduler import Job
@@ -37,8 +34,8 @@ class Base(NamedTuple):
     """What all points have in common."""
 
     experiment: str  # as the user named it
-    source: Source  # of the experiment
-    chosen: Experiment  # with the settings that all points share
+    source: loading.Source  # of the experiment
+    chosen: definition.Experiment  # with the settings that all points share
     words: tuple[str, ...]  # of the run command, those of the points excepted
     seeds: int
     folder: Path  # of the sweep
@@ -102,7 +99,7 @@ def read_value(base: Base, name: str, text: str) -> Any:
     """Returns a setting's value of the type that it has; UserError if it is of another."""
     *path, last = name.replace("-", "_").split(".")
     owner: Any = functools.reduce(getattr, path, base.chosen)
-    kind = hints(type(owner)).get(last, type(getattr(owner, last)))
+    kind = kinds.hints(type(owner)).get(last, type(getattr(owner, last)))
     # A class with this setting alone: rules that join several settings come later, in `check`.
     one: Any = Annotated[kind, tyro.conf.arg(name=name)]
     alone = dataclasses.make_dataclass("Alone", [("value", one)], frozen=True)

@@ -21,8 +21,7 @@ from purerl.core.keys import Purpose, derive
 from purerl.core.records import Array, PyTree
 from purerl.devices.compilation import jit, start as compile_beside
 from purerl.ppo.episodes import is_lost
-from purerl.report.episode_pictures import Picture, take_picture
-from purerl.report.renderer import model_of
+from purerl.report import episode_pictures, renderer
 from purerl.tune.option_numbers import Place, numbers_of, replaced
 from purerl.tune.view.drivers import Driver
 
@@ -41,7 +40,7 @@ class Moment(struct.PyTreeNode):
 class Shown(NamedTuple):
     """What a control step shows; numpy on the host."""
 
-    picture: Picture  # after the step
+    picture: episode_pictures.Picture  # after the step
     reward: Array  # []
     metrics: dict[str, Array]  # name -> []
     action: Array  # [A]
@@ -57,7 +56,7 @@ class Program(NamedTuple):
     env: Any
     live: dict[Place, int | float]  # numbers that are arguments: their first values
     fixed: dict[Place, int | float]  # numbers that it was built with
-    start: Callable[[Numbers, Array], tuple[Moment, Picture]]
+    start: Callable[[Numbers, Array], tuple[Moment, episode_pictures.Picture]]
     step: Callable[[Numbers, PyTree, Moment], tuple[Moment, Shown]]
 
 
@@ -133,7 +132,7 @@ def _on_host(moment: Moment, shown: Any) -> tuple[Moment, Any]:
 
 
 def _check(env: Any, observed: PyTree) -> None:
-    model_of(env)
+    renderer.model_of(env)
     given = jax.eval_shape(env.reset, jax.random.key(0)).observation
     given, wanted = (jax.tree.map(lambda x: list(x.shape), tree) for tree in (given, observed))
     if observed is not None and given != wanted:
@@ -165,11 +164,11 @@ def find_live(build: Callable[[Numbers], Any], numbers: Numbers) -> dict[Place, 
     return live if traces(live) else {}
 
 
-def begin(env: Any, driver: Driver, key: Array) -> tuple[Moment, Picture]:
+def begin(env: Any, driver: Driver, key: Array) -> tuple[Moment, episode_pictures.Picture]:
     """Starts an episode."""
     state = env.reset(jax.random.fold_in(key, 0))
     first = Moment(state, driver.start(env), key, jnp.zeros((), jnp.int32))
-    return first, take_picture(env, state)
+    return first, episode_pictures.take_picture(env, state)
 
 
 def move(env: Any, driver: Driver, brain: PyTree, moment: Moment) -> tuple[Moment, Shown]:
@@ -178,7 +177,7 @@ def move(env: Any, driver: Driver, brain: PyTree, moment: Moment) -> tuple[Momen
     action, value, memory = driver.act(env, brain, moment.env, moment.memory, key)
     state = env.step(moment.env, action)
     shown = Shown(
-        picture=take_picture(env, state),
+        picture=episode_pictures.take_picture(env, state),
         reward=state.reward,
         metrics=state.metrics,
         action=action,

@@ -14,8 +14,7 @@ import mujoco
 import numpy as np
 import trimesh
 
-from purerl.report.episode_pictures import Picture
-from purerl.report.renderer import Stage
+from purerl.report import episode_pictures, renderer
 
 SPHERE, ROD, BOX = "sphere", "rod", "box"
 _GEOM = mujoco.mjtGeom
@@ -57,7 +56,7 @@ class Layout(NamedTuple):
     scales: np.ndarray  # [N, 3]
 
 
-def pose(stage: Stage, picture: Picture) -> None:
+def pose(stage: renderer.Stage, picture: episode_pictures.Picture) -> None:
     """Puts a stage's model into the place and form of a picture."""
     stage.put(picture)
     mujoco.mj_kinematics(stage.model, stage.data)
@@ -94,7 +93,7 @@ def layout(model: mujoco.MjModel, data: mujoco.MjData, batch: Batch) -> Layout:
     )
 
 
-def scenery_layout(picture: Picture) -> Layout | None:
+def scenery_layout(picture: episode_pictures.Picture) -> Layout | None:
     """Returns the boxes of an episode that are only drawn; None if there are none."""
     if not picture.scenery or not len(picture.scenery[0]):
         return None
