@@ -120,9 +120,7 @@ def unpack(packed: list[Array], template: PyTree) -> Any:
         if is_key(like):
             impl = str(jax.random.key_impl(jnp.empty((0,), like.dtype)))
             return jax.random.wrap_key_data(x, impl=impl)
-        if like.dtype == jnp.float32:
-            return jax.lax.bitcast_convert_type(x, jnp.float32)
-        return x
+        return jax.lax.bitcast_convert_type(x, jnp.float32) if like.dtype == jnp.float32 else x
 
     leaves, tree = jax.tree.flatten(template)
     return jax.tree.unflatten(tree, [one(*pair) for pair in zip(packed, leaves, strict=True)])

@@ -52,8 +52,7 @@ def _moved(params: PyTree) -> PyTree:
     until then.
     """
     leaves, tree = jax.tree.flatten(params)
-    keys = jax.random.split(jax.random.key(0), len(leaves))
-    pairs = zip(keys, leaves, strict=True)
+    pairs = zip(jax.random.split(jax.random.key(0), len(leaves)), leaves, strict=True)
     moved = [x + STEP * jax.random.normal(k, x.shape, x.dtype) for k, x in pairs]
     return jax.tree.unflatten(tree, moved)
 

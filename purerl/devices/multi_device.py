@@ -102,9 +102,7 @@ def assemble(layout: Layout, spec: PartitionSpec, trees: Sequence[PyTree]) -> Py
 @jax.jit
 def join(trees: Sequence[PyTree]) -> PyTree:
     """Concatenates trees of one device along the first axis."""
-    if len(trees) == 1:
-        return trees[0]
-    return jax.tree.map(lambda *x: jnp.concatenate(x), *trees)
+    return trees[0] if len(trees) == 1 else jax.tree.map(lambda *x: jnp.concatenate(x), *trees)
 
 
 @functools.partial(jax.jit, static_argnums=2)
@@ -231,8 +229,7 @@ def compile_collects(
     )
 
     def build(device: Any) -> Any:
-        here = SingleDeviceSharding(device)
-        return program.lower(*shapes((learned, places), here)).compile()
+        return program.lower(*shapes((learned, places), SingleDeviceSharding(device))).compile()
 
     (device, _), *others = layout.here
     # The first alone: where the persistent cache serves all devices, the others find it there.

@@ -91,8 +91,7 @@ def in_branch(compute: Callable, *leaves: Array) -> list[Array]:
     never = some.ravel()[0].astype(jnp.float32) < -jnp.inf
 
     def nothing(*leaves: Array) -> list[Array]:
-        shapes = jax.eval_shape(compute, *leaves)
-        return [jnp.zeros(x.shape, x.dtype) for x in shapes]
+        return [jnp.zeros(x.shape, x.dtype) for x in jax.eval_shape(compute, *leaves)]
 
     return jax.lax.cond(never, nothing, compute, *leaves)
 

@@ -103,8 +103,7 @@ def check_settings(config: Config) -> Iterator[Finding]:
 
 def _starts(setup: Setup, number: int) -> State:
     """Returns fresh environments."""
-    keys = jax.random.split(jax.random.key(0), number)
-    return jax.jit(jax.vmap(setup.env.reset))(keys)
+    return jax.jit(jax.vmap(setup.env.reset))(jax.random.split(jax.random.key(0), number))
 
 
 def _speeds(setup: Setup, start: State) -> Iterator[Finding]:

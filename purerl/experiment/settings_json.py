@@ -95,6 +95,5 @@ def _check_names(names: list[str], values: Any, path: str) -> None:
     for name in sorted(set(names).symmetric_difference(values)):
         if name in names:
             raise UserError(f"config.json lacks {_join(path, name)}, which the experiment has.")
-        valid = [_join(path, n) for n in names]
-        what = unknown_name("setting", _join(path, name), valid)
+        what = unknown_name("setting", _join(path, name), [_join(path, n) for n in names])
         raise UserError(f"config.json: {what} The code may be of another version.")

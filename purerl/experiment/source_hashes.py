@@ -23,14 +23,8 @@ PACKAGE = Path(__file__).parent.parent
 # Rooms, and modules of other rooms, that no program is traced from. They prepare a run, look after
 # it or look at it. The modules of rooms that compute only raise errors or word them.
 LEFT_OUT = {"checks", "experiment", "machine", "report", "runs", "training", "tune"}
-LEFT_OUT |= {
-    "adapters.to_gymnasium",
-    "core.errors",
-    "devices.check_sizes",
-    "devices.memory",
-    "devices.processes",
-    "ppo.checks",
-}
+LEFT_OUT |= {"adapters.to_gymnasium", "core.errors", "ppo.checks"}
+LEFT_OUT |= {"devices.check_sizes", "devices.memory", "devices.processes"}
 
 # Environments and experiments count where they are imported, as a person's own do.
 IMPORTED = {"envs", "experiments", "assets"}

@@ -66,8 +66,7 @@ class CEngine:
         fields = tuple(state.__dataclass_fields__)
         host = functools.partial(_run_rows, self, fields, names, substeps)
         name = "-".join([self.name, str(substeps), *fields, *names])
-        shapes = [leaf.shape for leaf in leaves] + self.shapes
-        out = host_calls.run(name, host, given, shapes)
+        out = host_calls.run(name, host, given, [leaf.shape for leaf in leaves] + self.shapes)
         state = jax.tree.unflatten(structure, out[: len(leaves)])
         return state, self.record(*out[len(leaves) :])
 

@@ -260,8 +260,7 @@ def _over_batch(function: Callable, axes: int = 0) -> Callable:
         lead = args[0].time.shape
         number = math.prod(lead)
         flat = jax.tree.map(lambda x: x.reshape(number, *x.shape[axes:]), args)
-        out = function(*flat)
-        return jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), out)
+        return jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), function(*flat))
 
     @call.def_vmap
     def add_axis(size: int, batched: list, *args: PyTree) -> tuple[PyTree, PyTree]:

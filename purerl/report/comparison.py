@@ -48,8 +48,7 @@ def compare(
     Raises:
       UserError: a place means no run, or there is no such metric or setting.
     """
-    runs = run_reader.read_runs(places, "compare")
-    result, curves = compare_records(runs, metric, group_by)
+    result, curves = compare_records(run_reader.read_runs(places, "compare"), metric, group_by)
     if result["unscored"] and not result["pairs"]:  # else the bits can be compared all the same
         raise UserError(result["unscored"])
     return result, curves

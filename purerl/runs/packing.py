@@ -48,9 +48,8 @@ def pack(run: Path, trust: bool) -> dict[Path, bytes]:
     place = Path("runs", restored.source.name, folder.path.name)
     kept = {restored.saved.meta["update"], *best[-1:]}
     saved = [checkpoint_folder.path_of(folder.checkpoints, update).rglob("*") for update in kept]
-    for file in filter(
-        Path.is_file, itertools.chain([folder.path / CONFIG, folder.metrics], *saved)
-    ):
+    files = [folder.path / CONFIG, folder.metrics, *itertools.chain(*saved)]
+    for file in filter(Path.is_file, files):
         packed[place / file.relative_to(folder.path)] = file.read_bytes()
     # Here it stands elsewhere, and whose machine this is concerns nobody.
     manifest = json.dumps(facts | {"experiment_file": str(name)}, indent=2).encode()

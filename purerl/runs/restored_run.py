@@ -61,28 +61,23 @@ def restore(
         say(f"{folder}: {what} is not that of the run any more.")
     for what in edited(run):
         say(f"Edited since the run: {what}.")
-    return RestoredRun(chosen, setup, _read_checkpoint(run, update, setup, say), source, run)
+    return RestoredRun(chosen, setup, read_checkpoint(run, update, setup, say), source, run)
 
 
-def read_checkpoint(folder: Path, update: str, setup: Setup, say: Say) -> checkpoint.Saved:
-    """Reads a checkpoint of a run whose objects are built; arguments as for `restore`."""
-    return _read_checkpoint(read_run(folder), update, setup, say)
+def read_checkpoint(run: Folder, update: str, setup: Setup, say: Say) -> checkpoint.Saved:
+    """Reads a checkpoint of a run whose objects are built; arguments as for `restore`.
 
-
-def _read_checkpoint(run: Folder, update: str, setup: Setup, say: Say) -> checkpoint.Saved:
+    Raises UserError if this machine has no room to read a state of its size.
+    """
     abstract = programs.abstract_state(*setup[:3])
     abstract = abstract.replace(env_state=None, episode=None, optimizer=None)
-    _check_memory(run.path, memory.size(abstract))
-    return _choose(run, update, abstract, say)
-
-
-def _check_memory(folder: Path, size: int) -> None:
-    """Raises UserError if this machine has no room to read a state of `size` bytes."""
-    if 2 * size > (room := memory.of_machine()):  # a reader holds it twice
+    size, room = memory.size(abstract), memory.of_machine()
+    if 2 * size > room:  # a reader holds it twice
         raise UserError(
-            f"The state of {folder} takes {size / 1e9:,.0f} GB, by its config.json; this machine "
+            f"The state of {run.path} takes {size / 1e9:,.0f} GB, by its config.json; this machine "
             f"has {room / 1e9:,.0f} GB of memory."
         )
+    return _choose(run, update, abstract, say)
 
 
 def _changed_since(begun: dict[str, Any], source: loading.Source, setup: Setup) -> list[str]:

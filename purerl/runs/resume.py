@@ -105,12 +105,10 @@ def what_to_write(
     Raises:
       UserError: this process would not continue the run exactly; or it has nothing to train.
     """
-    if not folder.is_run:
-        return _identity(folder) | now.manifest
-    found = changes(folder, now)
-    if not found:
+    found = changes(folder, now) if folder.is_run else []
+    if folder.is_run and not found:
         return None
-    if not begun:
+    if not (folder.is_run and begun):
         return _identity(folder) | now.manifest
     if not allow_changes:
         raise UserError(
@@ -202,15 +200,14 @@ def _noted(folder: Folder, found: list[str]) -> dict[str, Any]:
     """
     old = folder.manifest
     known = {name: old[name] for name in ("run_id", "name")}
-    after = max(folder.updates, default=0)
-    entry: dict[str, Any] = {"after_update": after, "changes": found}
-    entry["fingerprint"] = old["fingerprint"]
+    noted = with_change(old, max(folder.updates, default=0), found)
     if known["name"] != folder.path.name:
-        entry, known = {"of": known} | entry, _identity(folder)
+        noted["allowed_changes"][-1]["of"], known = known, _identity(folder)
     had = {name: old[name] for name in ("had_checkpoint",) if name in old}
-    return known | had | with_change(old, entry)
+    return known | had | noted
 
 
-def with_change(facts: dict[str, Any], entry: dict[str, Any]) -> dict[str, Any]:
+def with_change(facts: dict[str, Any], after: int, found: list[str]) -> dict[str, Any]:
     """Returns the list of what --allow-changes let pass, as manifest.json has it, with one more."""
+    entry = {"after_update": after, "changes": found, "fingerprint": facts["fingerprint"]}
     return {"allowed_changes": [*facts.get("allowed_changes", []), entry]}

@@ -211,7 +211,5 @@ def _open_metrics(
     change = f"{folder.metrics.name}: it was not what the run wrote; its whole lines are kept"
     say(change)
     place = keep_whole_lines(folder.metrics, meta["update"])
-    entry = {"after_update": meta["update"], "changes": [change]}
-    entry["fingerprint"] = folder.manifest["fingerprint"]
-    folder = note(folder, **resume.with_change(folder.manifest, entry))
+    folder = note(folder, **resume.with_change(folder.manifest, meta["update"], [change]))
     return folder, MetricsFile(folder.metrics, *place)

@@ -13,6 +13,7 @@ import jax
 
 from purerl import exact
 from purerl.checks.held_arrays import hash_held
+from purerl.checks.user_code import users_errors
 from purerl.core.errors import UserError
 from purerl.core.records import PyTree
 from purerl.devices import compilation, processes, programs
@@ -59,8 +60,7 @@ def execute(
         loggers.check_loggers(options)
         cache = compilation.set_up_jax(options.cache)
         job = prepare(source, experiments[0], found, options, stop)._replace(listener=listener)
-        seeds = begin(source, runs, job, cache, stack)
-        train_all(job, seeds)
+        train_all(job, begin(source, runs, job, cache, stack))
 
 
 def prepare(
@@ -102,12 +102,10 @@ def _choose_shards(
             f"with --num-shards {devices}."
         )
     shards = Shards(number, devices if number > 1 else 1)
-    try:
+    with users_errors(""):
         check_shards(shards, config.num_envs)
         name = "num_envs / num_shards" if number > 1 else "num_envs"
         check_minibatches(config, is_recurrent(abstract.memory), config.num_envs // number, name)
-    except ValueError as error:
-        raise UserError(str(error)) from error
     return shards
 
 

@@ -1,7 +1,7 @@
 """What is planned for or looked at: an experiment, or a run with what it has learned."""
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -69,8 +69,7 @@ def find(words: Sequence[str], prog: str) -> Subject:
     if not Path(name).is_dir():
         return Subject(name, loading.find_source(name), None)
     # Options that say how to read the run, whose experiment says which other options there are.
-    early: Callable[..., Any] = argparse.ArgumentParser
-    parser = early(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--checkpoint", default="latest")
     parser.add_argument("--engine", default="")
     parser.add_argument("--trust", action="store_true")

@@ -55,8 +55,7 @@ def advance(
       to the episode, "kept", "action", "reward", "metrics" and "judged".
     """
     now, number = playing.progress, len(playing.progress.over)
-    step_key = jax.random.fold_in(key, now.t)
-    keys = per_environment(step_key, jnp.arange(number))
+    keys = per_environment(jax.random.fold_in(key, now.t), jnp.arange(number))
     choose = functools.partial(planner.plan, settings, env, guide)
     plans, action = jax.vmap(choose)(playing.plan, now.env_state, keys)
     following = evaluation.advance(env, now, action, ())

@@ -78,8 +78,7 @@ def setting(base: Base, name: str) -> Any:
         raise UserError("Each point is trained with several seeds already: give --seeds 3.")
     names = _names(base.chosen)
     if name not in names:
-        hint = other_trainers.suggest(name, names)
-        said = f"There is no setting {name!r}. {hint}".strip()
+        said = f"There is no setting {name!r}. {other_trainers.suggest(name, names)}".strip()
         page = f"python -m purerl.run {shlex.quote(base.experiment)} --help"
         raise UserError(f"{said} All settings: {page}")
     return names[name]
@@ -168,7 +167,6 @@ def job(base: Base, point: Point) -> Job:
     names = [point.name]
     if base.seeds > 1:
         words += ["--num-seeds", str(base.seeds)]
-        first = base.chosen.seed
-        names = [f"{point.name}-seed{first + i}" for i in range(base.seeds)]
+        names = [f"{point.name}-seed{base.chosen.seed + i}" for i in range(base.seeds)]
     folders = tuple(base.folder / base.source.name / name for name in names)
     return Job(point.name, tuple(words), folders, base.folder / "logs" / f"{point.name}.log")

@@ -62,8 +62,7 @@ def _show_commands(sweep: Sweep) -> int:
         first = study.propose(study.open_study(None), sweep.spaces, sweep.options.optuna)
         shown = list(itertools.islice(first, study.FIRST))
     for point in shown:
-        job = points.job(sweep.base, point)
-        show(shlex.join(["python", "-m", "purerl.run", *job.words]))
+        show(shlex.join(["python", "-m", "purerl.run", *points.job(sweep.base, point).words]))
     if sweep.options.optuna > len(shown):
         show(f"# The other {sweep.options.optuna - len(shown)} points depend on scores.")
     return SUCCESS
@@ -189,8 +188,7 @@ class _Progress:
         self.results.append(result)
         point, metric, score = self.points[result.job.name], self.sweep.options.metric, None
         if result.status == "done":
-            group = table.group_of(self.sweep.base, point)
-            score = table.summarize(group, metric)["score"]
+            score = table.summarize(table.group_of(self.sweep.base, point), metric)["score"]
             told_now = point.name in self.begun or len(self.results) == self.number
             if score is None and told_now:
                 table.check_metric(self.sweep.base, self.points.values(), metric)

@@ -170,10 +170,8 @@ def draw(path: Path, rows: Sequence[Row], spaces: Sequence[Space], metric: str) 
     columns = min(COLUMNS, len(spaces))
     lines = -(-len(spaces) // columns)
     size = (4.5 * columns + 1, 3.6 * lines)
-    with comparison.picture(path, lines, columns, figsize=size, sharey=True, squeeze=False) as (
-        figure,
-        axes,
-    ):
+    drawn = comparison.picture(path, lines, columns, figsize=size, sharey=True, squeeze=False)
+    with drawn as (figure, axes):
         for panel, space in zip(axes.flat, spaces, strict=False):
             _draw_panel(panel, rows, space)
         for panel in axes.flat[len(spaces) :]:

@@ -16,7 +16,7 @@ from purerl.experiment.definition import Experiment
 from purerl.experiment.objects import Setup, build
 from purerl.machine.output import show
 from purerl.runs import checkpoint_folder, loaded_run, restored_run
-from purerl.runs.folder import CHECKPOINTS, CODE
+from purerl.runs.folder import CHECKPOINTS, CODE, read_run
 from purerl.tune import option_numbers, overrides
 from purerl.tune.plan import planner
 from purerl.tune.subject import Subject
@@ -65,7 +65,7 @@ def _of_run(run: loaded_run.Run, chosen: Experiment, options: Any) -> tuple[Sess
     driver = planner_driver(options, guide, brain) if planned else policy_driver(guide, brain)
 
     def other_brain(name: str) -> tuple[TrainState, str]:
-        saved = restored_run.read_checkpoint(run.folder, name, setup, show)
+        saved = restored_run.read_checkpoint(read_run(run.folder), name, setup, show)
         return jax.device_put(saved.state), _words(saved.meta["update"], saved.meta["steps"])
 
     written = run.restored.source.experiment

@@ -187,8 +187,7 @@ def fail(session: Session, why: str) -> Session:
 
 def start_episode(session: Session, episode: int) -> Session:
     """Starts an episode of the session's seed."""
-    key = episode_key(session.seed, episode)
-    moment, picture = session.program.start(session.numbers, key)
+    moment, picture = session.program.start(session.numbers, episode_key(session.seed, episode))
     return session._replace(
         episode=episode, moment=moment, picture=picture, rows=(), sums={}, length=0, grip=None
     )

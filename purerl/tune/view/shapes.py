@@ -13,6 +13,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from purerl.report import episode_pictures, renderer
 
@@ -88,7 +89,7 @@ def layout(model: mujoco.MjModel, data: mujoco.MjData, batch: Batch) -> Layout:
     along = (batch.sides * size[:, 1])[:, None] * rotations[:, :, 2]
     return Layout(
         positions=np.asarray(data.geom_xpos[geoms] + along, np.float32),
-        wxyzs=np.asarray(_quaternions(rotations), np.float32),
+        wxyzs=Rotation.from_matrix(rotations).as_quat(scalar_first=True).astype(np.float32),
         scales=np.asarray(_scales(batch.shape, model.geom_type[geoms], size), np.float32),
     )
 
@@ -147,14 +148,6 @@ def _scales(shape: str, kinds: np.ndarray, size: np.ndarray) -> np.ndarray:
     if shape == ROD:
         return np.concatenate([radius, radius, half], axis=1)
     return size if shape == BOX else np.ones_like(size)
-
-
-def _quaternions(rotations: np.ndarray) -> np.ndarray:
-    """Returns [N, 3, 3] rotations as quaternions [N, 4], w first."""
-    found = np.zeros((len(rotations), 4))
-    for quaternion, rotation in zip(found, rotations, strict=True):
-        mujoco.mju_mat2Quat(quaternion, rotation.ravel())
-    return found
 
 
 def _mesh(model: mujoco.MjModel, name: str) -> trimesh.Trimesh:
