@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from purerl.checks import check_env, check_traces, examine_model, watch_physics
+from purerl.checks import check_env, check_traces, examine_physics
 from purerl.checks.findings import Finding, error, ok, some, warning
 from purerl.checks.user_code import in_words, own_line, program_errors
 from purerl.core.env import ABSURD, Env, EnvError, State
@@ -44,9 +44,9 @@ def examine(env: Env, num_steps: int = NUM_STEPS) -> Iterator[Finding]:
     yield from check_trial(trial)
     if reason := reasons.most():
         yield warning("mujoco", reason)
-    yield from watch_physics.check_controls(env, trial)
-    yield from watch_physics.check_placed(env)
-    yield from examine_model.check_model(env, trial)
+    yield from examine_physics.check_controls(env, trial)
+    yield from examine_physics.check_placed(env)
+    yield from examine_physics.check_model(env, trial)
 
 
 def check_repeats(env: Env, trial: check_env.Trial) -> Finding:

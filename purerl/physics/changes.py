@@ -1,7 +1,11 @@
-"""Fields of a model that differ between simulations: which may, what follows, what cannot act."""
+"""Fields of a model that differ between simulations: which may, what follows, what cannot act.
+
+Constants that MuJoCo derives from fields are computed anew where those have changed: `derive`.
+"""
 
 import contextlib
 import copy
+import functools
 import re
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -10,9 +14,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from mujoco.batch import Batch, SimulationError
 
 from purerl.core.errors import unknown_name
 from purerl.core.records import Array
+from purerl.physics import host_calls, lookup, reasons
 from purerl.physics.left_out import LEFT_OUT
 
 # Floats of MjModel that are of no one simulation (of meshes, of users), or that MJX does not trace.
@@ -159,3 +165,36 @@ def check_shape(name: str, value: Any, shape: tuple[int, ...]) -> None:
             f"{name} has shape {jnp.shape(value)}; one simulation of this model takes {shape}. "
             "Batches are the caller's vmap."
         )
+
+
+def derive(
+    model: mujoco.MjModel, changes: dict[str, Any], wanted: tuple[str, ...]
+) -> dict[str, Array]:
+    """Returns the `wanted` constants of a model with changes: by mj_setConst, on the host."""
+    names = tuple(sorted(changes))
+    name = "-".join(["purerl-derive", lookup.hash_model(model, wanted), *names])
+    host = functools.partial(_derive_rows, copy.copy(model), names, wanted)
+    shapes = [getattr(model, n).shape for n in wanted]
+    found = host_calls.run(name, host, [changes[n] for n in names], shapes)
+    return dict(zip(wanted, found, strict=True))
+
+
+def _derive_rows(
+    model: mujoco.MjModel, names: tuple[str, ...], wanted: tuple[str, ...], rows: Any
+) -> np.ndarray:
+    """Derives packed rows: [..., changes] -> [..., constants]; NaN where MuJoCo refuses."""
+    flat = np.asarray(rows).reshape(-1, np.shape(rows)[-1])
+    batch = Batch(model, len(flat), nthread=host_calls.usable_cores())
+    fields = [batch.expand(name) for name in names]
+    host_calls.unpack(fields, flat)
+    for name, field in zip(names, fields, strict=True):
+        if name in ("body_pos", "body_quat"):  # a mocap body is where the state says
+            field[:, model.body_mocapid >= 0] = getattr(model, name)[model.body_mocapid >= 0]
+    with contextlib.suppress(SimulationError):  # `status` says which
+        batch.set_const()
+    for i in np.flatnonzero(batch.status):
+        reasons.note(batch.error(int(i)))
+    found = [batch.expand(name).reshape(len(flat), -1) for name in wanted]
+    out = np.concatenate(found, axis=1, dtype=np.float32)
+    out[batch.status != 0] = np.nan
+    return out.reshape(*np.shape(rows)[:-1], out.shape[-1])

@@ -186,12 +186,10 @@ class Physics:
         Raises:
           ValueError: an unknown field, another shape, or a change that cannot act or be followed.
         """
-        from purerl.physics.constants import derive  # mujoco.batch is slow to import
-
         fields.check_fields(self.model, self.engine, changes)
         behind = {constant for name in changes for constant in self._follows(name)}
         wanted = tuple(sorted(behind & set(fields.CONSTANTS) - set(changes)))
-        more = derive(self.model, changes, wanted) if wanted else {}
+        more = fields.derive(self.model, changes, wanted) if wanted else {}
         return self.check_changes({**changes, **more})
 
     def check_changes(self, changes: dict[str, Array] | None) -> dict[str, Array]:

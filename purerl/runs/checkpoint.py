@@ -21,7 +21,7 @@ from purerl.core.errors import UserError, one_line
 from purerl.core.records import PyTree
 from purerl.machine import array_files, files
 from purerl.machine.state_arrays import Leaves, digest_leaves, leaf_paths, raw, unflatten
-from purerl.runs import checkpoint_folder, identity
+from purerl.runs import checkpoint_folder, manifest
 
 
 class Saved(NamedTuple):
@@ -65,7 +65,7 @@ def save(folder: Path, leaves: Leaves, meta: dict[str, Any]) -> Path:
     return path
 
 
-def load_checkpoint(path: Path, abstract: PyTree, owners: Sequence[identity.Owner] = ()) -> Saved:
+def load_checkpoint(path: Path, abstract: PyTree, owners: Sequence[manifest.Owner] = ()) -> Saved:
     """Reads one checkpoint and checks every hash.
 
     Args:
@@ -79,7 +79,7 @@ def load_checkpoint(path: Path, abstract: PyTree, owners: Sequence[identity.Owne
         `abstract` (other sizes or networks).
     """
     meta = checkpoint_folder.load_meta(path)
-    identity.check_owner(path, meta, owners)
+    manifest.check_owner(path, meta, owners)
     wanted = _check_fits(path, meta, abstract)
     checkpoint_folder.check_files(path, meta)
     leaves = {key: np.zeros(shape, jnp.dtype(dtype)) for key, (dtype, shape) in wanted.items()}
@@ -104,7 +104,7 @@ def newest(
     abstract: PyTree,
     say: Callable[[str], None],
     rename: bool = True,
-    owners: Sequence[Sequence[identity.Owner]] = (),
+    owners: Sequence[Sequence[manifest.Owner]] = (),
 ) -> list[Saved]:
     """Reads the newest update that all folders hold whole.
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from purerl.core.errors import UserError
 from purerl.machine import files, lock
 from purerl.runs import checkpoint_folder
-from purerl.runs.identity import fingerprint
+from purerl.runs.manifest import fingerprint
 
 CONFIG, MANIFEST, CODE = "config.json", "manifest.json", "experiment.py"
 METRICS, CHECKPOINTS = "metrics.jsonl", "checkpoints"

@@ -12,7 +12,7 @@ from purerl.experiment import definition, loading, settings_json, source_hashes
 from purerl.experiment.objects import Setup, build, physics_hash
 from purerl.experiment.trust import load_copy
 from purerl.machine.output import Say
-from purerl.runs import checkpoint, checkpoint_folder, identity
+from purerl.runs import checkpoint, checkpoint_folder, manifest
 from purerl.runs.folder import CODE, CONFIG, Folder, check_manifest, read_run
 from purerl.runs.resume import edited
 
@@ -108,7 +108,7 @@ def _fill(old: Any, new: Any, say: Say, path: str = "") -> Any:
 
 def _choose(run: Folder, update: str, abstract: TrainState, say: Say) -> checkpoint.Saved:
     """Reads the checkpoint that was asked for; see `restore`."""
-    folder, owners = run.checkpoints, identity.owners(check_manifest(run))
+    folder, owners = run.checkpoints, manifest.owners(check_manifest(run))
     if update == "latest":
         whole = checkpoint.newest([folder], abstract, say, rename=False, owners=[owners])
         if not whole:

@@ -29,7 +29,7 @@ from purerl.experiment.options import RunOptions
 from purerl.machine import command_errors, files, output
 from purerl.machine.lock import FolderLock
 from purerl.ppo.algorithm import start_stage
-from purerl.runs import checkpoint, checkpoint_folder, identity, manifest, resume
+from purerl.runs import checkpoint, checkpoint_folder, manifest, resume
 from purerl.runs.folder import CHECKPOINTS, Folder, check_manifest, note
 from purerl.runs.metrics_file import MetricsFile, Record, keep_whole_lines
 from purerl.training import console, loggers, loop
@@ -147,7 +147,7 @@ def _newest(job: Job, seeds: list[Seed], say: output.Say) -> list[checkpoint.Sav
     folders = [seed.folder for seed in seeds if seed.folder]
     places = [folder.checkpoints for folder in folders]
     facts = list(map(check_manifest, folders))
-    saved = checkpoint.newest(places, job.abstract, say, owners=list(map(identity.owners, facts)))
+    saved = checkpoint.newest(places, job.abstract, say, owners=list(map(manifest.owners, facts)))
     if not saved:
         promised = any(one.get("had_checkpoint") for one in facts)
         checkpoint_folder.check_none_lost(places, promised)
