@@ -8,7 +8,6 @@ planner. Sliders change the numbers of the environment's options, which begin as
 A run's folder is only read, and may be training meanwhile.
 """
 
-import functools
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -60,7 +59,7 @@ def command(words: Sequence[str]) -> None:
         page.close()
 
 
-main = main_of_words(command, functools.partial(show_help, ViewOptions, __doc__, PROG))
+main = main_of_words(command, lambda words: show_help(ViewOptions, __doc__, PROG, words))
 
 
 if __name__ == "__main__":

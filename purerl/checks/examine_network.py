@@ -1,6 +1,5 @@
 """Checks of a network on real observations: is it finite, and does it use what it is given?"""
 
-import functools
 from collections.abc import Iterator
 from typing import Any
 
@@ -26,9 +25,9 @@ def examine(network: Network, observation: PyTree) -> Iterator[Finding]:
     inputs = jax.tree.map(_normalize, observation)
     number = jax.tree.leaves(inputs)[0].shape[0]
     memory = jax.tree.map(lambda x: jnp.zeros((number, *x.shape), x.dtype), carry)
-    probe = functools.partial(jax.jit(_probe, static_argnums=0), network)
-    answers, gradients = probe(params, inputs, memory)
-    (_, following), moved = probe(_moved(params), inputs, memory)
+    probe = jax.jit(_probe, static_argnums=0)
+    answers, gradients = probe(network, params, inputs, memory)
+    (_, following), moved = probe(network, _moved(params), inputs, memory)
     _, scale, value = answers[0]
     broken = [n for n, x in zip(("loc", "scale", "value"), answers[0], strict=True) if _bad(x)]
     if broken:

@@ -7,7 +7,6 @@ Initialisation and evaluation are programs of one device too.
 """
 
 import functools
-import itertools
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -173,7 +172,7 @@ def update(
 
     places, experience = zip(*told_by.map(act, range(len(collects))), strict=True)
     improved, metrics = improve(state.learned, assemble(layout, SPLIT, experience))
-    return Spread(improved, tuple(itertools.chain(*places))), metrics
+    return Spread(improved, tuple(one for some in places for one in some)), metrics
 
 
 def compile_update(

@@ -12,7 +12,6 @@ scan that stands still once the loop would have ended. Before each round of a `w
 for the host, which reads the condition. Unlike a `while`, a scan has a reverse-mode derivative.
 """
 
-import functools
 from collections.abc import Iterator, Sequence
 from types import ModuleType
 from typing import Any
@@ -59,7 +58,7 @@ def _kernel(module: ModuleType, platform: str) -> Rule:
     """
 
     def replace(eqn: core.JaxprEqn, inputs: Sequence, inside: Inside) -> list:
-        return with_own_derivative(eqn, functools.partial(module.compute, eqn, platform), inputs)
+        return with_own_derivative(eqn, lambda *x: module.compute(eqn, platform, *x), inputs)
 
     return Rule(module.wanted, replace)
 

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from purerl.checks import check_env, check_traces
 from purerl.checks.user_code import check_takes, users_errors
@@ -190,7 +189,7 @@ def _check_memory_starts_at_zero(network: Network, carry: PyTree) -> None:
     """Raises ValueError unless `init` gives a memory of zeros, with which every episode starts."""
     if jax.tree.leaves(carry):
         memory = jax.jit(lambda key: network.init(key)[1])(jax.random.key(0))
-        if any(np.asarray(x).any() for x in jax.tree.leaves(memory)):
+        if any(jnp.any(x) for x in jax.tree.leaves(memory)):
             raise ValueError(
                 "The network's memory starts as other numbers than 0, and every episode starts "
                 "with zeros: return zeros from `init`, and add the rest in `apply`."

@@ -7,7 +7,6 @@ arguments, which is what `jax.pure_callback` and `host_calls` ask for.
 
 import copy
 import functools
-import math
 import threading
 from typing import Any, NamedTuple
 
@@ -124,7 +123,7 @@ def _run_rows(
         full[:] = (batch.warning[:, _FULL, 1] > 0).any(axis=1)
         if "overflow" not in engine.record._fields:
             bad |= full > 0  # nobody looks
-        read = [source.reshape(len(flat), math.prod(source.shape[1:])) for source in sources]
+        read = [source.reshape(len(flat), source[0].size) for source in sources]
         out = np.concatenate(read, axis=1, dtype=np.float32)
     out[bad] = np.nan
     return out.reshape(*rows.shape[:-1], out.shape[-1])

@@ -5,7 +5,6 @@ from typing import Any
 
 import flax.linen as nn
 import jax
-import numpy as np
 
 from purerl.core.keys import Purpose, derive
 from purerl.core.records import Array, TrainState
@@ -89,6 +88,6 @@ def record(setup: Setup, state: TrainState, seed: int, number: int) -> Leaves:
     rows |= {name: getattr(now, name) for name in ("observation", "physics", "metrics", "task")}
     # Names of modules and metrics may have slashes of their own, which stay as they are.
     leaves = {name.replace("~1", "/"): x for name, x in flatten(rows).items() if x.size}
-    arrays = {name: np.swapaxes(x, 0, 1) for name, x in leaves.items()}
+    arrays = {name: x.swapaxes(0, 1) for name, x in leaves.items()}
     length = arrays.pop("running").sum(axis=1)
     return {"length": length} | {name: x[:, : length.max()] for name, x in arrays.items()}

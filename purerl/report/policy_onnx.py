@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import onnx
 import onnxruntime
@@ -54,7 +53,7 @@ def build_model(
         action, memory = policy.act(observation, memory)
         if limits is None:
             return action, [], memory
-        low, high = jnp.asarray(limits).T
+        low, high = limits.T
         return action, [low + 0.5 * (action + 1.0) * (high - low)], memory
 
     arguments = (policy.observation, policy.memory)

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from purerl.core.errors import UserError, one_line
@@ -82,7 +81,7 @@ def load_checkpoint(path: Path, abstract: PyTree, owners: Sequence[manifest.Owne
     manifest.check_owner(path, meta, owners)
     wanted = _check_fits(path, meta, abstract)
     checkpoint_folder.check_files(path, meta)
-    leaves = {key: np.zeros(shape, jnp.dtype(dtype)) for key, (dtype, shape) in wanted.items()}
+    leaves = {key: np.zeros(shape, np.dtype(dtype)) for key, (dtype, shape) in wanted.items()}
     try:
         leaves |= array_files.read(path / "state", {k: x for k, x in leaves.items() if x.size})
         _compare(leaves, meta["leaves"])

@@ -6,7 +6,6 @@ with the run's id: they say whose file it is (`Owner`).
 
 import hashlib
 import json
-import math
 import os
 import platform
 import re
@@ -181,7 +180,7 @@ class Owner(NamedTuple):
 
     run_id: str
     fingerprint: str
-    until: float = math.inf  # the last update that it trained
+    until: float = float("inf")  # the last update that it trained
 
 
 def fingerprint(config: dict[str, Any], facts: dict[str, Any], source: bytes) -> str:

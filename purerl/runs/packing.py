@@ -3,7 +3,6 @@
 import glob
 import gzip
 import io
-import itertools
 import json
 import shlex
 import sys
@@ -47,8 +46,8 @@ def pack(run: Path, trust: bool) -> dict[Path, bytes]:
     best = [update for _, update in checkpoint_folder.best_by_stage(folder.checkpoints).values()]
     place = Path("runs", restored.source.name, folder.path.name)
     kept = {restored.saved.meta["update"], *best[-1:]}
-    saved = [checkpoint_folder.path_of(folder.checkpoints, update).rglob("*") for update in kept]
-    files = [folder.path / CONFIG, folder.metrics, *itertools.chain(*saved)]
+    saved = (checkpoint_folder.path_of(folder.checkpoints, update).rglob("*") for update in kept)
+    files = [folder.path / CONFIG, folder.metrics, *(file for some in saved for file in some)]
     for file in filter(Path.is_file, files):
         packed[place / file.relative_to(folder.path)] = file.read_bytes()
     # Here it stands elsewhere, and whose machine this is concerns nobody.

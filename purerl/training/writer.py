@@ -4,7 +4,6 @@ The order matters: a checkpoint says how long metrics.jsonl was when it was take
 when the disk has all of that. Training does not wait for hashes or the disk.
 """
 
-import math
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -84,7 +83,7 @@ class RunWriter:
     def best(self) -> float:
         """Returns the highest evaluation return that a checkpoint of this stage has, else -inf."""
         stages = checkpoint_folder.best_by_stage(self.checkpoints)
-        return stages.get(self.signature["fingerprint"], (-math.inf, 0))[0]
+        return stages.get(self.signature["fingerprint"], (float("-inf"), 0))[0]
 
     def finish(self) -> None:
         """Waits until everything is on the disk; RunError if the last checkpoint is not."""

@@ -7,7 +7,6 @@ shape the model, or are compared with something while the environment is built; 
 takes a new program, which is built beside the old one.
 """
 
-import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -114,17 +113,15 @@ def build_program(
     except Exception as error:  # of the environment's code: any
         raise UserError(one_line(error)) from error
     fixed = {place: value for place, value in every.items() if place not in live}
-    taken = functools.partial(_in_order, live)
+
+    def taken(numbers: Numbers) -> tuple:  # each of the type that it had
+        return tuple(type(first)(numbers[place]) for place, first in live.items())
+
     return Program(
         env, live, fixed,
         start=lambda numbers, key: _on_host(*start(taken(numbers), key)),
         step=lambda numbers, brain, moment: _on_host(*step(taken(numbers), brain, moment)),
     )  # fmt: skip
-
-
-def _in_order(live: Numbers, numbers: Numbers) -> tuple:
-    """Returns the live numbers as a program takes them: each of the type that it had."""
-    return tuple(type(first)(numbers[place]) for place, first in live.items())
 
 
 def _on_host(moment: Moment, shown: Any) -> tuple[Moment, Any]:
