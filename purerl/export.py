@@ -52,9 +52,8 @@ def writer(name: str) -> Any:
     """Returns the function that writes a format: only what it needs is imported."""
     missing = [package for package in NEEDS[name] if importlib.util.find_spec(package) is None]
     if missing:
-        raise UserError(
-            f"--format {name} needs {', '.join(missing)}: {purerl.how_to_install('export')}"
-        )
+        line = purerl.how_to_install("export")
+        raise UserError(f"--format {name} needs {', '.join(missing)}: {line}")
     return getattr(importlib.import_module(f"purerl.report.policy_{name}"), f"write_{name}")
 
 

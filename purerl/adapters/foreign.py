@@ -60,10 +60,7 @@ class ForeignEnv:
 
 
 def adapt(
-    env: Any,
-    model: mujoco.MjModel | None,
-    simulation: Callable[[Any], Any],
-    control_timestep: float,
+    env: Any, model: mujoco.MjModel | None, simulation: Callable[[Any], Any], timestep: float
 ) -> ForeignEnv:
     """Returns their environment as ours.
 
@@ -71,11 +68,11 @@ def adapt(
       env: theirs.
       model: the MuJoCo model that it simulates, to draw it; or None.
       simulation: their state to its simulation.
-      control_timestep: [s].
+      timestep: of control [s].
     """
     template = jax.eval_shape(env.reset, jax.random.key(0))
     drawn = Drawn(model) if model is not None else None
-    return ForeignEnv(env, template, simulation, drawn, int(env.action_size), control_timestep)
+    return ForeignEnv(env, template, simulation, drawn, int(env.action_size), timestep)
 
 
 def float32(x: Any) -> Array:

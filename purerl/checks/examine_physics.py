@@ -79,16 +79,14 @@ def _describe_controls(model: Any, given: np.ndarray) -> Finding:
     least, most = flat.min(0), flat.max(0)
     low, high = model.actuator_ctrlrange.T
     slack = TINY * np.maximum(high - low, 1.0)
-    beyond = model.actuator_ctrllimited.astype(bool) & (
-        (least < low - slack) | (most > high + slack)
-    )
+    over = model.actuator_ctrllimited.astype(bool) & ((least < low - slack) | (most > high + slack))
     names = lookup.names(model, "actuator")
-    if not beyond.any():
+    if not over.any():
         return ok("controls", f"of {model.nu} actuators, none beyond its ctrlrange")
-    i = int(np.argmax(beyond))
+    i = int(np.argmax(over))
     return warning(
         "controls",
-        f"{beyond.sum()} of {model.nu} actuators are driven beyond their ctrlrange, where MuJoCo "
+        f"{over.sum()} of {model.nu} actuators are driven beyond their ctrlrange, where MuJoCo "
         f"clamps: {names[i] or i} gets {least[i]:.3g} to {most[i]:.3g}, and has {low[i]:.3g} to "
         f"{high[i]:.3g}; map actions by lookup.scale_action.",
     )
@@ -137,7 +135,7 @@ def _named(names: tuple[str, ...], call: tuple) -> dict[str, Any]:
 
 def _find_zeros(physics: Any, begun: Begun) -> Iterator[Finding]:
     """Finds quaternions of zeros."""
-    from purerl.physics.as_built import ZERO_ROTATION, has_zero_rotation
+    from purerl.physics.changes import ZERO_ROTATION, has_zero_rotation
 
     changes = begun.given.get("changes") or {}
     for i, qpos in enumerate(begun.given["qpos"]):
@@ -240,9 +238,8 @@ def check_ranges(model: Any) -> Iterator[Finding]:
     small &= 2 * small.sum() > (turns > 0).sum()  # a file has one unit; a few joints may be stiff
     for unit, odd in (("radians", small), ("degrees", turns > LARGE)):
         for i in np.flatnonzero(odd)[:1]:
-            what = (
-                f"joint {lookup.names(model, 'joint')[i] or i} turns by {turns[i]:.3g} rad at most"
-            )
+            name = lookup.names(model, "joint")[i] or i
+            what = f"joint {name} turns by {turns[i]:.3g} rad at most"
             cure = f'were they written in {unit}? See <compiler angle="..."/>'
             yield warning("ranges", f"{what}, and {odd.sum()} ranges look like that: {cure}.")
 

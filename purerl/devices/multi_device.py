@@ -190,9 +190,7 @@ def compile_update(
         ),
         compiler_options=exact.equal_passes(),
     )  # fmt: skip
-    whole = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct((shards.number, *x.shape[1:]), x.dtype), experience
-    )
+    whole = resized(experience, shards.number)
     traced = improving.trace(
         shapes(learned, NamedSharding(mesh, SAME)), shapes(whole, NamedSharding(mesh, SPLIT))
     )
@@ -216,16 +214,18 @@ def compile_update(
     )
 
 
+def resized(tree: PyTree, size: int) -> PyTree:
+    """Returns the shapes of a tree with a first axis of another size."""
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((size, *x.shape[1:]), x.dtype), tree)
+
+
 def compile_collects(
     layout: Layout, config: Config, env: Env, network: Network, abstract: TrainState
 ) -> tuple[list[Callable], PyTree, list[str]]:
     """Compiles `collect` for each device here; returns also its result's shapes, its loose sums."""
     program = jax.jit(portable(functools.partial(collect, config, env, network)), donate_argnums=1)
     learned = abstract.replace(**dict.fromkeys(PLACES))
-    places = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct((layout.size, *x.shape[1:]), x.dtype),
-        {name: getattr(abstract, name) for name in PLACES},
-    )
+    places = resized({name: getattr(abstract, name) for name in PLACES}, layout.size)
 
     def build(device: Any) -> Any:
         return program.lower(*shapes((learned, places), SingleDeviceSharding(device))).compile()

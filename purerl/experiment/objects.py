@@ -143,11 +143,9 @@ def _check_network(network: Network, observation: PyTree, action_size: int) -> N
                 "`apply`."
             )
     _check_memory_starts_at_zero(network, carry)
-    batch = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct((2, *x.shape), x.dtype), (observation, carry)
-    )
+    two = jax.tree.map(lambda x: jax.ShapeDtypeStruct((2, *x.shape), x.dtype), (observation, carry))
     said = "apply(params, observation, memory)"
-    output, following = _pair(said, "a purerl.PolicyOutput", network.apply, params, *batch)
+    output, following = _pair(said, "a purerl.PolicyOutput", network.apply, params, *two)
     if not isinstance(output, PolicyOutput):
         raise ValueError(
             f"The network's `apply` returned a {type(output).__name__} and a memory; it must be "
@@ -164,7 +162,7 @@ def _check_network(network: Network, observation: PyTree, action_size: int) -> N
                 f"The network's {name} is {list(answer.shape)} for 2 observations and "
                 f"{action_size} actions; it must be {list(shape)}."
             )
-    kinds = [jax.tree.map(lambda x: (x.shape, x.dtype), tree) for tree in (batch[1], following)]
+    kinds = [jax.tree.map(lambda x: (x.shape, x.dtype), tree) for tree in (two[1], following)]
     if kinds[0] != kinds[1]:
         raise ValueError(
             f"The network's memory goes in as {kinds[0]} and comes back as {kinds[1]}, for 2 "

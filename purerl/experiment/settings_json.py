@@ -59,10 +59,8 @@ def from_json(template: Any, values: Any, path: str = "") -> Any:
             kind, given = kinds.get(name, Any), values[name]
             if not fits(kind, given) and given != (like := to_json(value)):
                 must = f"{inspect.formatannotation(kind)}, such as {like!r}"
-                where = _join(path, name)
-                raise UserError(
-                    f"config.json: {where} is {reprlib.repr(given)}; it must be {must}."
-                )
+                said = f"{_join(path, name)} is {reprlib.repr(given)}; it must be {must}."
+                raise UserError(f"config.json: {said}")
         try:
             read = {n: from_json(value, values[n], _join(path, n)) for n, value in known.items()}
             return dataclasses.replace(template, **read)

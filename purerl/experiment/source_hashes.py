@@ -226,11 +226,8 @@ def _is_stale(name: str, file: Path, known: dict[Path, tuple[Any, bytes]]) -> bo
         then, now = known[file][1], file.read_bytes() if file.exists() else b""
         return then != now and hash_code(then) != hash_code(now)
     # Who imported it before may have edited it since.
-    return (
-        name in sys.modules
-        and name.partition(".")[0] != PACKAGE.name
-        and file.stat().st_mtime > _BEGIN
-    )
+    is_own = name in sys.modules and name.partition(".")[0] != PACKAGE.name
+    return is_own and file.stat().st_mtime > _BEGIN
 
 
 def _imports(module: str, file: Path) -> list[str]:

@@ -19,9 +19,7 @@ from mujoco.batch import Batch, SimulationError
 from purerl.core.records import Array, PyTree
 from purerl.physics import host_calls, lookup, reasons
 
-_BLOWN_UP = [
-    int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{x}")) for x in ("QPOS", "QVEL", "QACC", "CTRL")
-]
+_BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{x}")) for x in ("QPOS", "QVEL", "QACC", "CTRL")]
 # Contacts or constraints that MuJoCo left out, as the model's memory was full.
 _FULL = [int(getattr(mujoco.mjtWarning, f"mjWARN_{x}FULL")) for x in ("CONTACT", "CNSTR")]
 
@@ -156,4 +154,4 @@ def _advance(batch: Batch, stage: int, substeps: int) -> np.ndarray:
     for i in np.flatnonzero(batch.status):
         reasons.note(batch.error(int(i)))
     # MuJoCo answers a blow-up with a warning and a silent reset of that simulation.
-    return (batch.status != 0) | (batch.warning[:, _BLOWN_UP, 1] > 0).any(axis=1)
+    return (batch.status != 0) | (batch.warning[:, _BAD, 1] > 0).any(axis=1)

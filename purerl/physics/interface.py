@@ -15,7 +15,7 @@ from flax import struct
 import purerl
 from purerl.core.errors import unknown_name
 from purerl.core.records import Array, PyTree
-from purerl.physics import as_built, changes as fields, left_out
+from purerl.physics import changes as fields, left_out
 
 ENGINES = ("auto", "c", "jax", "warp")
 
@@ -115,7 +115,7 @@ class Physics:
         if not isinstance(substeps, int | np.integer) or substeps < 1:
             raise ValueError(f"substeps is {substeps!r}: a control step needs 1, 2, 3 or more.")
         self.model, self.substeps = model, substeps
-        self._built = as_built.numbers(model, fields.CHANGEABLE_FIELDS)
+        self._built = fields.numbers(model, fields.CHANGEABLE_FIELDS)
         late = (model.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC).any()
         self.reads_forces = bool({*_ACCELERATION, *["sensordata"] * bool(late)} & {*readings})
         self._follows = functools.cache(functools.partial(fields.consequences, copy.copy(model)))
@@ -153,7 +153,7 @@ class Physics:
         if ctrl is not None:
             fields.check_shape("ctrl", ctrl, (model.nu,))
             ctrl = _float32(ctrl)
-        qpos = as_built.refuse_zero_rotations(model, qpos, changes)
+        qpos = fields.refuse_zero_rotations(model, qpos, changes)
         mocap = np.argsort(model.body_mocapid, kind="stable")[model.nbody - model.nmocap :]
         state = PhysicsState(
             qpos=_float32(qpos),
@@ -194,7 +194,7 @@ class Physics:
 
     def check_changes(self, changes: dict[str, Array] | None) -> dict[str, Array]:
         """Returns changes in float32; ValueError for those that cannot act, or are half."""
-        as_built.check_unedited(self.model, self._built)
+        fields.check_unedited(self.model, self._built)
         fields.check_fields(self.model, self.engine, changes or {})
         return fields.check_whole(self.model, changes or {}, self._follows)
 

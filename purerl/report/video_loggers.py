@@ -67,10 +67,8 @@ def as_gif(video: Path) -> tuple[bytes, tuple[int, int]]:
     kept = (frame for i, frame in enumerate(reader) if i % stride == 0)
     frames = [Image.frombytes("RGB", (width, height), frame).resize(size) for frame in kept]
     content = io.BytesIO()
-    milliseconds = round(1000 * stride / about["fps"])
-    frames[0].save(
-        content, "GIF", save_all=True, append_images=frames[1:], duration=milliseconds, loop=0
-    )
+    ms = round(1000 * stride / about["fps"])
+    frames[0].save(content, "GIF", save_all=True, append_images=frames[1:], duration=ms, loop=0)
     return content.getvalue(), size
 
 

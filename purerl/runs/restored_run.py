@@ -47,9 +47,8 @@ def restore(
     original = Path(begun["experiment_file"]).absolute()
     source = load_copy(run.path / CODE, run.code, run.config["experiment"], original, trust)
     settings = _fill(run.config["settings"], settings_json.to_json(source.experiment), say)
-    chosen = settings_json.from_json(
-        source.experiment, settings | ({"engine": engine} if engine else {})
-    )
+    settings |= {"engine": engine} if engine else {}
+    chosen = settings_json.from_json(source.experiment, settings)
     try:
         setup = build(chosen)
     except (UserError, RunError):
@@ -124,9 +123,8 @@ def _choose(run: Folder, update: str, abstract: TrainState, say: Say) -> checkpo
     if str(number) not in found:
         valid = ", ".join(["latest", "best", *found])
         raise UserError(f"There is no checkpoint {update!r} in {folder}. Valid: {valid}.")
+    path = checkpoint_folder.path_of(folder, int(number))
     try:
-        return checkpoint.load_checkpoint(
-            checkpoint_folder.path_of(folder, int(number)), abstract, owners
-        )
+        return checkpoint.load_checkpoint(path, abstract, owners)
     except checkpoint_folder.DamagedError as error:
         raise UserError(f"The checkpoint of update {number} is damaged: {error}.") from error

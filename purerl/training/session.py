@@ -34,13 +34,15 @@ from purerl.training import console, loggers
 from purerl.training.plan import make_plan
 from purerl.training.seeds import Job, Seed, train_all
 
+Stop = Callable[[], bool]  # tells whether a signal asked to stop
+
 
 def execute(
     source: Source,
     runs: dict[Path, Experiment],
     found: Sequence[Folder],
     options: RunOptions,
-    stop: Callable[[], bool],
+    stop: Stop,
     listener: Any = None,
 ) -> None:
     """Prepares the folders and the programs, and trains.
@@ -64,11 +66,7 @@ def execute(
 
 
 def prepare(
-    source: Source,
-    chosen: Experiment,
-    found: Sequence[Folder],
-    options: RunOptions,
-    stop: Callable[[], bool],
+    source: Source, chosen: Experiment, found: Sequence[Folder], options: RunOptions, stop: Stop
 ) -> Job:
     """Builds the experiment's objects, and says how they will be trained; arguments as above."""
     with compilation.no_collection():

@@ -103,10 +103,7 @@ def build_program(
             (lambda v, k: begin(built(v), driver, k), (values, key)),
             (lambda v, b, m: move(built(v), driver, b, m), (values, brain, first)),
         ]
-        compiled = [
-            compile_beside("init", jit("init", function).trace(*given))
-            for function, given in programs
-        ]
+        compiled = [compile_beside("init", jit("init", f).trace(*given)) for f, given in programs]
         start, step = (program.result()[0] for program in compiled)
     except (UserError, RunError):
         raise
