@@ -101,15 +101,13 @@ def describe(result: dict[str, Any]) -> list[str]:
     if result["unscored"]:
         return [*lines, f"No scores: {result['unscored']}"]
     groups, versus = result["groups"], result["versus_first"]
-    short = short_names([g["label"] for g in groups])
-    lines += [f"group {name} is {label}" for label, name in short.items() if name != label]
-    named = [
-        g | {"worst_run": Path(g["worst_run"]).name, "label": short[g["label"]]} for g in groups
-    ]
-    lines += table(GROUPS, named)
+    said = short_names([g["label"] for g in groups])
+    lines += [f"group {name} is {label}" for label, name in said.items() if name != label]
+    rows = [g | {"worst_run": Path(g["worst_run"]).name, "label": said[g["label"]]} for g in groups]
+    lines += table(GROUPS, rows)
     if versus:
-        lines += ["", f"against {short[versus[0]['baseline']]}:"]
-        lines += table(VERSUS, [v | {"label": short[v["label"]]} for v in versus])
+        lines += ["", f"against {said[versus[0]['baseline']]}:"]
+        lines += table(VERSUS, [v | {"label": said[v["label"]]} for v in versus])
         if any(v["same_seeds"] for v in versus):
             lines.append(
                 "Paired: differences between runs of one seed, which begin with the same weights "

@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from purerl.core.errors import UserError
+from purerl.core.errors import UserError, reason
 from purerl.machine import files, lock
 from purerl.runs import checkpoint_folder
 from purerl.runs.manifest import fingerprint
@@ -89,7 +89,7 @@ def _list(path: Path) -> Folder:
         names = frozenset(entry.name for entry in entries)
         return Folder(path, path.exists(), names, frozenset(links), {}, {}, b"", updates, damaged)
     except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read: {files.reason(error)}.") from error
+        raise UserError(f"{path} cannot be read: {reason(error)}.") from error
 
 
 def read_run(path: Path) -> Folder:
@@ -164,4 +164,4 @@ def runs_in(place: Path) -> list[Path]:
         below = (sorted(place.glob(f"{stars}/{CONFIG}")) for stars in ("*", "*/*"))
         return [file.parent for file in next(filter(None, below), [])]
     except (OSError, ValueError) as error:
-        raise UserError(f"{place} cannot be read: {files.reason(error)}.") from error
+        raise UserError(f"{place} cannot be read: {reason(error)}.") from error

@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from purerl.checks import held_arrays, user_code
+from purerl.checks import findings, held_arrays, user_code
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.records import TrainState
 from purerl.devices import memory, programs
@@ -86,8 +86,7 @@ def _changed_since(begun: dict[str, Any], source: loading.Source, setup: Setup) 
     edited = [name for name, value in now.items() if then.get(name) != value]
     # The run's own copy of its experiment, `source`, cannot have been edited.
     edited = [name for name in edited if source_hashes.module_file(name) != source.path]
-    few = ", ".join(edited[:3]) + (f" and {len(edited) - 3} more" if len(edited) > 3 else "")
-    found = [f"The code of {few}"] if edited else []
+    found = [f"The code of {findings.some(edited, 3)}"] if edited else []
     if setup.engine == begun["engine"] and physics_hash(setup.env) != begun["model"]:
         found.append("MuJoCo's model")
     held = begun.get("arrays")  # of older runs there is none

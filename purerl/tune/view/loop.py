@@ -7,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 from purerl.checks.user_code import program_errors
-from purerl.core.errors import UserError, one_line
+from purerl.core.errors import UserError, one_line, reason
 from purerl.tune.option_numbers import label
 from purerl.tune.view import opening, session as events
 from purerl.tune.view.session import Session, advance, to_build
@@ -27,7 +27,7 @@ def check_port(host: str, port: int) -> None:
     try:
         socket.create_server((host, port)).close()
     except (OSError, OverflowError) as error:
-        why = getattr(error, "strerror", None) or one_line(error)
+        why = reason(error)
         cure = "another --port (0 to 65535), or an address of this machine as --host"
         raise UserError(f"{host}:{port} cannot be listened on ({why}): give {cure}.") from error
 
