@@ -16,6 +16,10 @@ from purerl.core.records import Array
 
 TINY = 1e-5  # of a range: what rounding may do
 FAR = 0.05  # [rad or m] from where a servo holds
+SOLVED = 0.01  # of what a control step moves: a solver that converged differs by rounding alone
+SMALL = np.radians(np.pi)  # a range that was probably written in radians, and read as degrees
+LARGE = 4 * np.pi  # one that was written in degrees, and read as radians
+SLIDE, NEWTON = 2, 2  # of mujoco.mjtJoint and mjtSolver
 
 
 class Seen(NamedTuple):
@@ -212,12 +216,6 @@ def check_changes(physics: Any, begun: Begun) -> Iterator[Finding]:
                 what = f"changes[{name!r}] is given to {call} and not to {other}"
                 cure = "which takes the model's own: give each call all of them."
                 yield warning("changes", f"{what}, {cure}")
-
-
-SOLVED = 0.01  # of what a control step moves: a solver that converged differs by rounding alone
-SMALL = np.radians(np.pi)  # a range that was probably written in radians, and read as degrees
-LARGE = 4 * np.pi  # one that was written in degrees, and read as radians
-SLIDE, NEWTON = 2, 2  # of mujoco.mjtJoint and mjtSolver
 
 
 def check_model(env: Env, trial: Trial) -> Iterator[Finding]:
