@@ -8,8 +8,7 @@ from pathlib import Path
 from purerl import __version__
 from purerl.core.errors import USAGE, UserError, unknown_name
 from purerl.experiment.loading import summary
-from purerl.machine.command_errors import leave, tell
-from purerl.machine.output import show
+from purerl.machine import command_errors, output
 
 COMMANDS = (
     "new", "check", "run", "evaluate", "render", "view", "record", "export", "pack", "compare",
@@ -30,14 +29,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name in COMMANDS:
         return importlib.import_module(f"purerl.{module_of(name)}").main(rest)
     if name == "--version":
-        show(__version__)
+        output.show(__version__)
         return 0
     if name not in ("", "-h", "--help"):
-        return tell(UserError(unknown_name("command", name, COMMANDS)))
+        return command_errors.tell(UserError(unknown_name("command", name, COMMANDS)))
     for command in COMMANDS:
         file = HERE / f"{module_of(command).replace('.', '/')}.py"
-        show(f"{command:9} {summary(file)}")
-    show("", "Options of a command: python -m purerl COMMAND --help")
+        output.show(f"{command:9} {summary(file)}")
+    output.show("", "Options of a command: python -m purerl COMMAND --help")
     return 0 if name else USAGE
 
 
@@ -47,7 +46,7 @@ def console() -> None:
     It looks there last: whatever a folder has, this library finds Python's and its own packages.
     """
     sys.path.append("")
-    leave(main)
+    command_errors.leave(main)
 
 
 if __name__ == "__main__":

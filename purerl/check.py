@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from purerl.core.errors import FAILURE
 from purerl.experiment.command_line import main_of_words, read_experiment
 from purerl.experiment.options import RunOptions
-from purerl.machine import output
-from purerl.machine.command_errors import leave
+from purerl.machine import command_errors, output
 
 
 @dataclass(frozen=True)
@@ -54,4 +53,4 @@ main = main_of_words(command, show_help)
 
 
 if __name__ == "__main__":
-    leave(main)
+    command_errors.leave(main)

@@ -15,8 +15,7 @@ import tyro
 
 from purerl.core.errors import FAILURE, SUCCESS
 from purerl.experiment.command_line import main_of
-from purerl.machine.command_errors import leave
-from purerl.machine.output import show
+from purerl.machine import command_errors, output
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ def command(options: CompareOptions) -> int:
     from purerl.report import comparison
 
     result, curves = comparison.compare(options.runs, options.metric, options.group_by)
-    show(*comparison.describe(result))
+    output.show(*comparison.describe(result))
     if options.out is not None:
         comparison.write(options.out, result, curves)
     broken = any(pair["same"] is False and pair["promised"] for pair in result["pairs"])
@@ -54,4 +53,4 @@ main = main_of(CompareOptions, command, "python -m purerl.compare")
 
 
 if __name__ == "__main__":
-    leave(main)
+    command_errors.leave(main)

@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING
 
 from purerl.experiment.command_line import main_of
 from purerl.experiment.options import PlayOptions
-from purerl.machine.command_errors import leave
-from purerl.machine.files import check_writable, write_answer
-from purerl.machine.output import show
+from purerl.machine import command_errors, files, output
 
 if TYPE_CHECKING:
     from purerl.runs.loaded_run import Evaluated
@@ -36,12 +34,12 @@ def command(options: EvaluateOptions) -> None:
 
     file = options.json
     if file is not None:
-        check_writable(file)
+        files.check_writable(file)
     run = load(options.run, options.checkpoint, options.engine, options.trust)
     result = run.evaluate(options.episodes, options.seed, options.stochastic)
-    show(*describe(result))
+    output.show(*describe(result))
     if file is not None:  # last: where the disk is full, the figures are on the screen
-        write_answer(file, (json.dumps(result, indent=2) + "\n").encode())
+        files.write_answer(file, (json.dumps(result, indent=2) + "\n").encode())
 
 
 def describe(result: "Evaluated") -> list[str]:
@@ -63,4 +61,4 @@ main = main_of(EvaluateOptions, command, "python -m purerl.evaluate")
 
 
 if __name__ == "__main__":
-    leave(main)
+    command_errors.leave(main)

@@ -19,9 +19,7 @@ import purerl
 from purerl.core.errors import UserError
 from purerl.experiment.command_line import main_of
 from purerl.experiment.options import PlayOptions
-from purerl.machine.command_errors import leave
-from purerl.machine.files import check_writable
-from purerl.machine.output import show
+from purerl.machine import command_errors, files, output
 
 NEEDS = {"npz": (), "jax": ("flatbuffers",), "onnx": ("onnx", "onnxruntime")}  # format: packages
 
@@ -42,21 +40,20 @@ def command(options: ExportOptions) -> None:
     from purerl.runs.loaded_run import load
 
     file = options.out or Path(f"policy.{options.format}")
-    check_writable(file)
+    files.check_writable(file)
     write = writer(options.format)
     run = load(options.run, options.checkpoint, options.engine, options.trust)
     policy = write(run, file)
-    show(record_episodes(run, options.seed).compare(policy))
-    show(f"{file} ({file.stat().st_size:,} bytes)")
+    output.show(record_episodes(run, options.seed).compare(policy))
+    output.show(f"{file} ({file.stat().st_size:,} bytes)")
 
 
 def writer(name: str) -> Any:
     """Returns the function that writes a format: only what it needs is imported."""
     missing = [package for package in NEEDS[name] if importlib.util.find_spec(package) is None]
     if missing:
-        raise UserError(
-            f"--format {name} needs {', '.join(missing)}: {purerl.how_to_install('export')}"
-        )
+        line = purerl.how_to_install("export")
+        raise UserError(f"--format {name} needs {', '.join(missing)}: {line}")
     return getattr(importlib.import_module(f"purerl.report.policy_{name}"), f"write_{name}")
 
 
@@ -64,4 +61,4 @@ main = main_of(ExportOptions, command, "python -m purerl.export")
 
 
 if __name__ == "__main__":
-    leave(main)
+    command_errors.leave(main)

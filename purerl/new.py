@@ -15,8 +15,7 @@ from typing import Annotated
 import tyro
 
 from purerl.experiment.command_line import main_of
-from purerl.machine.command_errors import leave
-from purerl.machine.output import show
+from purerl.machine import command_errors, output
 
 
 @dataclass(frozen=True)
@@ -31,13 +30,13 @@ def command(options: NewOptions) -> None:
     """Writes the files, and says how to go on."""
     from purerl.experiment.new_project import write_project
 
-    show(*map(str, write_project(options.name)), "", f"cd {shlex.quote(str(options.name))}")
-    show("python -m purerl.check experiment.py    # what can be checked before training")
-    show("python -m purerl.run experiment.py      # trains it")
+    output.show(*map(str, write_project(options.name)), "", f"cd {shlex.quote(str(options.name))}")
+    output.show("python -m purerl.check experiment.py    # what can be checked before training")
+    output.show("python -m purerl.run experiment.py      # trains it")
 
 
 main = main_of(NewOptions, command, "python -m purerl.new")
 
 
 if __name__ == "__main__":
-    leave(main)
+    command_errors.leave(main)

@@ -12,9 +12,7 @@ from typing import Annotated
 import tyro
 
 from purerl.experiment.command_line import main_of
-from purerl.machine.command_errors import leave
-from purerl.machine.files import write_answer
-from purerl.machine.output import show
+from purerl.machine import command_errors, files, output
 
 ENDING = ".tar.gz"
 
@@ -38,16 +36,16 @@ def command(options: PackOptions) -> None:
     if options.open:
         folder = Path(options.run.name.removesuffix(ENDING))
         unpack(options.run, folder)
-        show(*how_to_go_on(folder))
+        output.show(*how_to_go_on(folder))
     else:
         packed = pack(options.run, options.trust)
         file = Path("-".join(options.run.absolute().parts[-2:]) + ENDING)
-        write_answer(file, as_archive(packed))
-        show(*sorted(map(str, packed)), f"{file} ({file.stat().st_size:,} bytes)")
+        files.write_answer(file, as_archive(packed))
+        output.show(*sorted(map(str, packed)), f"{file} ({file.stat().st_size:,} bytes)")
 
 
 main = main_of(PackOptions, command, "python -m purerl.pack")
 
 
 if __name__ == "__main__":
-    leave(main)
+    command_errors.leave(main)

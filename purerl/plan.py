@@ -15,8 +15,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from purerl.experiment.command_line import main_of_words
-from purerl.machine import output
-from purerl.machine.command_errors import leave
+from purerl.machine import command_errors, output
 
 PROG = "python -m purerl.plan"
 
@@ -92,4 +91,4 @@ main = main_of_words(command, show_help)
 
 
 if __name__ == "__main__":
-    leave(main)
+    command_errors.leave(main)

@@ -12,8 +12,7 @@ import tyro
 
 from purerl.core.errors import UserError
 from purerl.experiment.command_line import main_of
-from purerl.machine.command_errors import leave
-from purerl.machine.output import show
+from purerl.machine import command_errors, output
 
 
 @dataclass(frozen=True)
@@ -42,14 +41,14 @@ def command(options: PlotOptions) -> None:
     check_plotted(runs, options.metric)
     curves = [every_curve(group, options.metric) for group in groups]
     columns, rows = shutil.get_terminal_size((100, 30))
-    show(*draw(curves, options.metric, columns, min(rows - 6, 24)))
+    output.show(*draw(curves, options.metric, columns, min(rows - 6, 24)))
     if options.out is not None:
         comparison.draw_curves(options.out, curves, options.metric)
-        show(str(options.out))
+        output.show(str(options.out))
 
 
 main = main_of(PlotOptions, command, "python -m purerl.plot")
 
 
 if __name__ == "__main__":
-    leave(main)
+    command_errors.leave(main)

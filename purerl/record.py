@@ -28,8 +28,7 @@ from pathlib import Path
 from purerl.core.errors import UserError, check_least
 from purerl.experiment.command_line import main_of
 from purerl.experiment.options import PlayOptions
-from purerl.machine.command_errors import leave
-from purerl.machine.files import check_writable, write_arrays
+from purerl.machine import command_errors, files
 from purerl.machine.output import show
 
 
@@ -49,10 +48,10 @@ def command(options: RecordOptions) -> None:
     from purerl.runs.loaded_run import load
 
     check_least(options, UserError, episodes=1)
-    check_writable(options.out)
+    files.check_writable(options.out)
     run = load(options.run, options.checkpoint, options.engine, options.trust)
     arrays = record(run.restored.setup, run.state, options.seed, options.episodes)
-    write_arrays(options.out, arrays)
+    files.write_arrays(options.out, arrays)
     show(*(f"{name:32} {x.dtype} {list(x.shape)}" for name, x in arrays.items()), str(options.out))
 
 
@@ -60,4 +59,4 @@ main = main_of(RecordOptions, command, "python -m purerl.record")
 
 
 if __name__ == "__main__":
-    leave(main)
+    command_errors.leave(main)

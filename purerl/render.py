@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from purerl.core.errors import UserError, check_least
 from purerl.experiment.command_line import main_of
 from purerl.experiment.options import PlayOptions
-from purerl.machine.command_errors import leave
-from purerl.machine.output import show
+from purerl.machine import command_errors, output
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,7 @@ class RenderOptions(PlayOptions):
 
 def command(options: RenderOptions) -> None:
     """Makes the video, and prints which files it made."""
-    show(*make(options))
+    output.show(*make(options))
 
 
 def make(options: RenderOptions) -> list[str]:
@@ -68,4 +67,4 @@ main = main_of(RenderOptions, command, "python -m purerl.render")
 
 
 if __name__ == "__main__":
-    leave(main)
+    command_errors.leave(main)

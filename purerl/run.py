@@ -22,8 +22,7 @@ from typing import Any
 from purerl.core.errors import SUCCESS, StoppedError, one_line
 from purerl.experiment import loading
 from purerl.experiment.command_line import main_of_words, read_experiment
-from purerl.machine import output
-from purerl.machine.command_errors import leave, tell
+from purerl.machine import command_errors, output
 
 
 def show_help(words: Sequence[str]) -> None:
@@ -40,7 +39,7 @@ def command(words: Sequence[str]) -> int:
     try:
         _train(words)
     except StoppedError as error:
-        code = tell(error)
+        code = command_errors.tell(error)
         more = [] if "--resume" in words else ["--resume"]
         output.warn(f"Go on with: {shlex.join(['python', '-m', 'purerl.run', *words, *more])}")
         return code
@@ -102,4 +101,4 @@ main = main_of_words(command, show_help)
 
 
 if __name__ == "__main__":
-    leave(main)
+    command_errors.leave(main)

@@ -8,7 +8,6 @@ planner. Sliders change the numbers of the environment's options, which begin as
 A run's folder is only read, and may be training meanwhile.
 """
 
-import functools
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,8 +15,7 @@ from typing import Literal
 
 from purerl.core.errors import UserError
 from purerl.experiment.command_line import main_of_words
-from purerl.machine.command_errors import check_installed, leave
-from purerl.machine.output import show
+from purerl.machine import command_errors, output
 from purerl.tune.subject import PlanOptions, chosen as settings_of, find, show_help
 
 PROG = "python -m purerl.view"
@@ -42,7 +40,7 @@ def command(words: Sequence[str]) -> None:
     found = find(words, PROG)
     prog = f"{PROG} {shlex.quote(found.name)}"
     chosen, options = settings_of(found, words[1:], prog, ViewOptions)
-    check_installed("viser", "view")  # its help needs no window
+    command_errors.check_installed("viser", "view")  # its help needs no window
     from purerl.tune.view import opening
     from purerl.tune.view.loop import check_port, play
     from purerl.tune.view.page import Page
@@ -53,16 +51,16 @@ def command(words: Sequence[str]) -> None:
     try:
         if options.port not in (0, page.port):  # viser takes the next one
             raise UserError(f"Port {options.port} was taken meanwhile: give another, as --port.")
-        show(f"{title}: open {page.address} in a browser; Ctrl-C ends.")
-        play(page, session, source, lambda line: show(line))
+        output.show(f"{title}: open {page.address} in a browser; Ctrl-C ends.")
+        play(page, session, source, lambda line: output.show(line))
     except KeyboardInterrupt:
-        show("Closed.")
+        output.show("Closed.")
     finally:
         page.close()
 
 
-main = main_of_words(command, functools.partial(show_help, ViewOptions, __doc__, PROG))
+main = main_of_words(command, lambda words: show_help(ViewOptions, __doc__, PROG, words))
 
 
 if __name__ == "__main__":
-    leave(main)
+    command_errors.leave(main)

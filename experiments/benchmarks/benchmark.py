@@ -31,6 +31,7 @@ import jax.numpy as jnp
 
 from purerl import exact
 from purerl.core.records import Array, PyTree, TrainState
+from purerl.devices.memory import size
 from purerl.experiment import command_line, objects
 from purerl.experiment.definition import Experiment
 from purerl.experiment.loading import find_source
@@ -41,7 +42,6 @@ from purerl.physics.lookup import scale_action
 from purerl.ppo import algorithm
 from purerl.ppo.evaluation import evaluate_policy
 from purerl.ppo.rollout import rollout
-from purerl.training.console import size
 
 PARTS = ("physics alone", "rollout", "learner", "update", "evaluation")
 

@@ -31,9 +31,8 @@ def __getattr__(name: str) -> Any:
         extra = _EXTRAS.get((error.name or "").partition(".")[0])
         if extra is None:
             raise
-        raise ImportError(
-            f"adapters.{name} needs {error.name}: {purerl.how_to_install(extra)}"
-        ) from error
+        line = purerl.how_to_install(extra)
+        raise ImportError(f"adapters.{name} needs {error.name}: {line}") from error
 
 
 def __dir__() -> list[str]:

@@ -60,10 +60,7 @@ class ForeignEnv:
 
 
 def adapt(
-    env: Any,
-    model: mujoco.MjModel | None,
-    simulation: Callable[[Any], Any],
-    control_timestep: float,
+    env: Any, model: mujoco.MjModel | None, simulation: Callable[[Any], Any], timestep: float
 ) -> ForeignEnv:
     """Returns their environment as ours.
 
@@ -71,11 +68,11 @@ def adapt(
       env: theirs.
       model: the MuJoCo model that it simulates, to draw it; or None.
       simulation: their state to its simulation.
-      control_timestep: [s].
+      timestep: of control [s].
     """
     template = jax.eval_shape(env.reset, jax.random.key(0))
     drawn = Drawn(model) if model is not None else None
-    return ForeignEnv(env, template, simulation, drawn, int(env.action_size), control_timestep)
+    return ForeignEnv(env, template, simulation, drawn, int(env.action_size), timestep)
 
 
 def float32(x: Any) -> Array:
@@ -120,9 +117,7 @@ def unpack(packed: list[Array], template: PyTree) -> Any:
         if is_key(like):
             impl = str(jax.random.key_impl(jnp.empty((0,), like.dtype)))
             return jax.random.wrap_key_data(x, impl=impl)
-        if like.dtype == jnp.float32:
-            return jax.lax.bitcast_convert_type(x, jnp.float32)
-        return x
+        return jax.lax.bitcast_convert_type(x, jnp.float32) if like.dtype == jnp.float32 else x
 
     leaves, tree = jax.tree.flatten(template)
     return jax.tree.unflatten(tree, [one(*pair) for pair in zip(packed, leaves, strict=True)])

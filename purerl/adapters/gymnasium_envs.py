@@ -54,9 +54,7 @@ def from_gymnasium(
     """
     try:
         gymnasium.spec(options.name)
-    except (
-        gymnasium.error.Error
-    ) as error:  # it names what is near, or a package that is not imported
+    except gymnasium.error.Error as error:  # it names what is near, or what is not imported
         what = f"There is no environment of Gymnasium {options.name!r}"
         raise ValueError(f"{what}: {one_line(error)}") from error
     return from_maker(lambda: gymnasium.make(options.name, max_episode_steps=-1))

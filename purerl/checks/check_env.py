@@ -193,17 +193,16 @@ def _check_same(reset: dict[str, str], step: dict[str, str]) -> None:
             f"{name} is in the state of {where} only: reset and step must return the same fields."
         )
     for name, spec in reset.items():
-        if spec == step[name]:
-            continue
-        if "weakly" in spec + step[name]:
+        if spec != step[name] and "weakly" in spec + step[name]:
             raise EnvError(
                 f"{name} is weakly typed in one of the two ({spec}; {step[name]}): give it a "
                 "dtype, as in jnp.float32(0) or jnp.zeros(())."
             )
-        raise EnvError(
-            f"{name} is {spec} from reset and {step[name]} from step: reset and step must "
-            "return the same shapes and dtypes."
-        )
+        if spec != step[name]:
+            raise EnvError(
+                f"{name} is {spec} from reset and {step[name]} from step: reset and step must "
+                "return the same shapes and dtypes."
+            )
 
 
 def _again(tree: PyTree) -> PyTree:

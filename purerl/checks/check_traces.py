@@ -10,7 +10,6 @@ from itertools import zip_longest
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
@@ -49,7 +48,7 @@ def check_traces(env: Env) -> None:
       EnvError: names which of the two differs, the line where it can be told, and the cure.
     """
     key = jax.eval_shape(lambda: jax.random.key(0))
-    action = jax.ShapeDtypeStruct((env.action_size,), jnp.float32)
+    action = jax.ShapeDtypeStruct((env.action_size,), np.float32)
     state = jax.eval_shape(env.reset, key)
     _check("reset", env.reset, key)
     _check("step", env.step, state, action)

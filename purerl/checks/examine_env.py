@@ -7,12 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from purerl.checks import check_env
-from purerl.checks.check_traces import check_traces
-from purerl.checks.examine_model import check_model
+from purerl.checks import check_env, check_traces, examine_physics
 from purerl.checks.findings import Finding, error, ok, some, warning
 from purerl.checks.user_code import in_words, own_line, program_errors
-from purerl.checks.watch_physics import check_controls, check_placed
 from purerl.core.env import ABSURD, Env, EnvError, State
 from purerl.core.errors import one_line
 from purerl.machine.state_arrays import flatten
@@ -47,15 +44,15 @@ def examine(env: Env, num_steps: int = NUM_STEPS) -> Iterator[Finding]:
     yield from check_trial(trial)
     if reason := reasons.most():
         yield warning("mujoco", reason)
-    yield from check_controls(env, trial)
-    yield from check_placed(env)
-    yield from check_model(env, trial)
+    yield from examine_physics.check_controls(env, trial)
+    yield from examine_physics.check_placed(env)
+    yield from examine_physics.check_model(env, trial)
 
 
 def check_repeats(env: Env, trial: check_env.Trial) -> Finding:
     """Tells whether the environment does the same twice: in one program, and in two."""
     checks = (
-        (check_traces, env),
+        (check_traces.check_traces, env),
         (check_env.check_keys_repeat, trial),
         (check_env.check_steps_repeat, trial),
     )
@@ -86,10 +83,7 @@ def first_state(start: State) -> list[Finding]:
         start = jax.tree.map(lambda x: x[0], start)
     size = np.shape(start.reward)[0]
     found = [check_keys(start)] if size > 1 else []
-    ended = np.asarray(start.terminated)
-    if ended.any():
-        what = f"{ended.sum()} of {size} episodes are terminated when reset returns"
-        found.append(error("ends", f"{what}: look at terminated in reset, or start elsewhere."))
+    found += _ended(np.asarray(start.terminated))
     return [one for one in found if one.level != "ok"]
 
 
@@ -153,20 +147,21 @@ def _leaves(trial: check_env.Trial) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     return {n: (x, later[n]) for n, x in start.items() if np.issubdtype(x.dtype, np.floating)}
 
 
+def _ended(over: np.ndarray) -> Iterator[Finding]:
+    """Finds episodes [B] that end before they begin."""
+    if over.any():
+        what = f"{over.sum()} of {over.size} episodes have ended when reset returns"
+        yield error("ends", f"{what}: look at terminated in reset, or start elsewhere.")
+
+
 def check_ends(trial: check_env.Trial) -> Iterator[Finding]:
     """Finds episodes that end before they begin, or that all last one step."""
     ended = np.asarray(trial.start.terminated | trial.start.truncated)
     first = np.asarray((trial.states.terminated | trial.states.truncated)[0])
-    if ended.any():
-        share = f"{ended.sum()} of {ended.size}"
-        yield error(
-            "ends",
-            f"{share} episodes have ended when reset returns: look at terminated "
-            "in reset, or start elsewhere.",
-        )
-    elif first.all():
+    yield from _ended(ended)
+    if first.all() and not ended.any():
         yield error("ends", "every episode ends at its first step: look at `terminated`.")
-    else:
+    elif not ended.any():
         yield ok("ends", "no episode begins ended")
 
 
@@ -188,17 +183,18 @@ def check_scale(trial: check_env.Trial) -> Iterator[Finding]:
         values = np.concatenate([start[None], later]).astype(np.float64)
         values = values.reshape(-1, *start.shape[1:])
         mean, std = values.mean(0), values.std(0)
+        still, steady = std == 0, (std > 0) & (np.abs(mean) > STEADY * std)
+        little = f"varies by less than 1/{STEADY:g} of its mean"
         kinds = {
-            "does not vary": std == 0,
-            f"varies by less than 1/{STEADY:g} of its mean": (std > 0)
-            & (np.abs(mean) > STEADY * std),
-            f"has a std beyond {LARGE:g}": std > LARGE,
+            "does not vary: leave it out, unless other actions than random ones change it": still,
+            f"{little}: take the mean off, or digits are lost": steady,
+            f"has a std beyond {LARGE:g}: choose another unit": std > LARGE,
         }
         for what, where in kinds.items():
             if where.any():
                 number += 1
                 places = some([str(list(map(int, i))) for i in np.argwhere(where)])
-                yield warning("scale", f"{name} {places} {what}: {_cure(what)}.")
+                yield warning("scale", f"{name} {places} {what}.")
     if not number:
         yield ok("scale", "every entry of the observation varies, at a sound scale")
 
@@ -216,18 +212,8 @@ def check_pictures(trial: check_env.Trial) -> Iterator[Finding]:
             elif not (moves := np.ptp(one, axis=0).any(0)).any():
                 yield warning("eyes", f"{what}: nothing moves in it, whatever the body does.")
             else:
-                said = (
-                    f"contrast {one.std():.2f}, where white is 1; {moves.mean():.0%} of its pixels"
-                )
-                yield ok("eyes", f"{what}: {said} move")
-
-
-def _cure(what: str) -> str:
-    if what.startswith("does not"):
-        return "leave it out, unless other actions than random ones change it"
-    if what.startswith("varies"):
-        return "take the mean off, or digits are lost"
-    return "choose another unit"
+                said = f"contrast {one.std():.2f} (white is 1), {moves.mean():.0%} of its pixels move"
+                yield ok("eyes", f"{what}: {said}")
 
 
 def check_actions(trial: check_env.Trial) -> Finding:
@@ -243,13 +229,10 @@ def check_actions(trial: check_env.Trial) -> Finding:
     actions = jnp.repeat(trial.actions[:, :1], number, 1) * flips
     states = trial.rollout(same, actions)[1]
     # Not the reward, which may just take the action's cost.
-    later = flatten((states.physics, states.observation, states.terminated))
-    idle = [
-        str(i)
-        for i in range(size)
-        if all((leaf[:, 1 + i] == leaf[:, 0]).all() for leaf in later.values())
-    ]
-    if idle:
-        what = f"entries {some(idle)} of {size} change nothing in {steps} steps"
+    later = flatten((states.physics, states.observation, states.terminated)).values()
+    acts = [(x[:, 1:] != x[:, :1]).any((0, *range(2, x.ndim)))[:size] for x in later]
+    idle = np.flatnonzero(~np.any(acts, 0))
+    if idle.size:
+        what = f"entries {some(list(map(str, idle)))} of {size} change nothing in {steps} steps"
         return warning("actions", f"{what}: is every entry used, and every actuator connected?")
     return ok("actions", f"each of {size} has an effect")

@@ -1,6 +1,5 @@
 """Checks of a network on real observations: is it finite, and does it use what it is given?"""
 
-import functools
 from collections.abc import Iterator
 from typing import Any
 
@@ -26,9 +25,9 @@ def examine(network: Network, observation: PyTree) -> Iterator[Finding]:
     inputs = jax.tree.map(_normalize, observation)
     number = jax.tree.leaves(inputs)[0].shape[0]
     memory = jax.tree.map(lambda x: jnp.zeros((number, *x.shape), x.dtype), carry)
-    probe = functools.partial(jax.jit(_probe, static_argnums=0), network)
-    answers, gradients = probe(params, inputs, memory)
-    (_, following), moved = probe(_moved(params), inputs, memory)
+    probe = jax.jit(_probe, static_argnums=0)
+    answers, gradients = probe(network, params, inputs, memory)
+    (_, following), moved = probe(network, _moved(params), inputs, memory)
     _, scale, value = answers[0]
     broken = [n for n, x in zip(("loc", "scale", "value"), answers[0], strict=True) if _bad(x)]
     if broken:
@@ -52,8 +51,7 @@ def _moved(params: PyTree) -> PyTree:
     until then.
     """
     leaves, tree = jax.tree.flatten(params)
-    keys = jax.random.split(jax.random.key(0), len(leaves))
-    pairs = zip(keys, leaves, strict=True)
+    pairs = zip(jax.random.split(jax.random.key(0), len(leaves)), leaves, strict=True)
     moved = [x + STEP * jax.random.normal(k, x.shape, x.dtype) for k, x in pairs]
     return jax.tree.unflatten(tree, moved)
 
@@ -81,9 +79,8 @@ def _probe(network: Network, params: PyTree, inputs: PyTree, memory: PyTree) -> 
     def weighted(params: PyTree, inputs: PyTree, which: tuple[int, ...]) -> Array:
         found = twice(params, inputs)[0]
         weights = [1.0 + jax.random.uniform(jax.random.key(i), found[i].shape) for i in which]
-        return sum(
-            (jnp.sum(w * found[i]) for w, i in zip(weights, which, strict=True)), jnp.zeros(())
-        )
+        parts = [jnp.vdot(w, found[i]) for w, i in zip(weights, which, strict=True)]
+        return jnp.sum(jnp.stack(parts))
 
     by_inputs = jax.grad(weighted, argnums=1)
     of_value, of_policy = (by_inputs(params, inputs, which) for which in ((2,), (0, 1)))

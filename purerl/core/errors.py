@@ -80,3 +80,8 @@ def one_line(error: BaseException) -> str:
     """Returns an exception as one line of text, with its class where the message alone is bare."""
     text = " ".join(str(error).split())
     return text if len(text) > 20 else f"{type(error).__name__}: {text}"
+
+
+def reason(error: BaseException) -> str:
+    """Returns why a file could not be read or written, in a few words."""
+    return getattr(error, "strerror", None) or one_line(error)

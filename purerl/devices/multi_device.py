@@ -7,7 +7,6 @@ Initialisation and evaluation are programs of one device too.
 """
 
 import functools
-import itertools
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -24,7 +23,6 @@ from purerl.core.records import Array, Metrics, Network, PyTree, TrainState
 from purerl.devices.compilation import Compiling, portable, shapes, start, unordered
 from purerl.devices.shards import AXIS, Shards, improve
 from purerl.ppo import algorithm
-from purerl.ppo.algorithm import Experience
 from purerl.ppo.config import Config
 
 # Fields of TrainState that are [B, ...].
@@ -103,9 +101,7 @@ def assemble(layout: Layout, spec: PartitionSpec, trees: Sequence[PyTree]) -> Py
 @jax.jit
 def join(trees: Sequence[PyTree]) -> PyTree:
     """Concatenates trees of one device along the first axis."""
-    if len(trees) == 1:
-        return trees[0]
-    return jax.tree.map(lambda *x: jnp.concatenate(x), *trees)
+    return trees[0] if len(trees) == 1 else jax.tree.map(lambda *x: jnp.concatenate(x), *trees)
 
 
 @functools.partial(jax.jit, static_argnums=2)
@@ -147,7 +143,7 @@ def fetch(layout: Layout, state: Spread) -> TrainState:
 
 def collect(
     config: Config, env: Env, network: Network, learned: TrainState, places: dict[str, PyTree]
-) -> tuple[dict[str, PyTree], Experience]:
+) -> tuple[dict[str, PyTree], algorithm.Experience]:
     """Moves one shard on; returns its places and, as one part [1, ...], what it saw."""
     state, experience = algorithm.collect(config, env, network, learned.replace(**places))
     return {name: getattr(state, name) for name in PLACES}, experience
@@ -176,7 +172,7 @@ def update(
 
     places, experience = zip(*told_by.map(act, range(len(collects))), strict=True)
     improved, metrics = improve(state.learned, assemble(layout, SPLIT, experience))
-    return Spread(improved, tuple(itertools.chain(*places))), metrics
+    return Spread(improved, tuple(one for some in places for one in some)), metrics
 
 
 def compile_update(
@@ -194,9 +190,7 @@ def compile_update(
         ),
         compiler_options=exact.equal_passes(),
     )  # fmt: skip
-    whole = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct((shards.number, *x.shape[1:]), x.dtype), experience
-    )
+    whole = resized(experience, shards.number)
     traced = improving.trace(
         shapes(learned, NamedSharding(mesh, SAME)), shapes(whole, NamedSharding(mesh, SPLIT))
     )
@@ -220,20 +214,21 @@ def compile_update(
     )
 
 
+def resized(tree: PyTree, size: int) -> PyTree:
+    """Returns the shapes of a tree with a first axis of another size."""
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((size, *x.shape[1:]), x.dtype), tree)
+
+
 def compile_collects(
     layout: Layout, config: Config, env: Env, network: Network, abstract: TrainState
 ) -> tuple[list[Callable], PyTree, list[str]]:
     """Compiles `collect` for each device here; returns also its result's shapes, its loose sums."""
     program = jax.jit(portable(functools.partial(collect, config, env, network)), donate_argnums=1)
     learned = abstract.replace(**dict.fromkeys(PLACES))
-    places = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct((layout.size, *x.shape[1:]), x.dtype),
-        {name: getattr(abstract, name) for name in PLACES},
-    )
+    places = resized({name: getattr(abstract, name) for name in PLACES}, layout.size)
 
     def build(device: Any) -> Any:
-        here = SingleDeviceSharding(device)
-        return program.lower(*shapes((learned, places), here)).compile()
+        return program.lower(*shapes((learned, places), SingleDeviceSharding(device))).compile()
 
     (device, _), *others = layout.here
     # The first alone: where the persistent cache serves all devices, the others find it there.

@@ -40,9 +40,8 @@ class Programs(NamedTuple):
 
 def abstract_state(config: Config, env: Env, network: Network) -> PyTree:
     """Returns the shapes and dtypes of a run's state without computing anything."""
-    return jax.eval_shape(
-        functools.partial(algorithm.init, config, env, network), jax.random.key(0)
-    )
+    init = functools.partial(algorithm.init, config, env, network)
+    return jax.eval_shape(init, jax.random.key(0))
 
 
 def compile_programs(
@@ -122,15 +121,13 @@ def compile_update(
 
     The `abstract` shapes of the state are [S, ...] if `vmapped`.
     """
-    whole: list[tuple[str, Callable]] = [
-        ("update", functools.partial(algorithm.update, config, env, network))
-    ]
-    halves: list[tuple[str, Callable]] = [
-        ("collect", functools.partial(algorithm.collect, config, env, network)),
-        ("improve", functools.partial(improve, config, network, Shards())),
-    ]
+    one: dict[str, Callable] = {"update": functools.partial(algorithm.update, config, env, network)}
+    halves: dict[str, Callable] = {
+        "collect": functools.partial(algorithm.collect, config, env, network),
+        "improve": functools.partial(improve, config, network, Shards()),
+    }
     given, traced, started = (abstract,), [], []
-    for name, function in halves if in_halves else whole:
+    for name, function in (halves if in_halves else one).items():
         function = jax.vmap(function) if vmapped else function
         traced.append(compilation.jit(name, function, donate_argnums=0).trace(*given))
         started.append((name, compilation.start(name, traced[-1])))

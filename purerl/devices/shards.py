@@ -21,12 +21,10 @@ from jax.extend import core
 from purerl.core.parts import WHOLE, Parts, add_in_order
 from purerl.core.records import Array, Metrics, Network, PyTree, TrainState
 from purerl.devices.slices import SIDE_BY_SIDE, count_slices, cut_in_slices
-from purerl.exact import pallas_calls
-from purerl.exact.traces import has_loop
-from purerl.ppo import algorithm
+from purerl.exact import pallas_calls, traces
+from purerl.ppo import algorithm, learner
 from purerl.ppo.algorithm import Experience
 from purerl.ppo.config import Config
-from purerl.ppo.learner import is_recurrent
 
 AXIS = "devices"
 
@@ -72,7 +70,7 @@ def each(function: Callable, *parts: PyTree) -> PyTree:
     # `function` reads and makes is set apart, also the arrays that it closes over.
     first = jax.tree.map(lambda x: x[0], parts)
     closed, shapes = jax.make_jaxpr(function, return_shape=True)(*first)
-    loops = has_loop(closed)
+    loops = traces.has_loop(closed)
 
     def alone(one: PyTree) -> list[Array]:
         consts, leaves = set_apart((closed.consts, jax.tree.leaves(one)))
@@ -93,8 +91,7 @@ def in_branch(compute: Callable, *leaves: Array) -> list[Array]:
     never = some.ravel()[0].astype(jnp.float32) < -jnp.inf
 
     def nothing(*leaves: Array) -> list[Array]:
-        shapes = jax.eval_shape(compute, *leaves)
-        return [jnp.zeros(x.shape, x.dtype) for x in shapes]
+        return [jnp.zeros(x.shape, x.dtype) for x in jax.eval_shape(compute, *leaves)]
 
     return jax.lax.cond(never, nothing, compute, *leaves)
 
@@ -147,7 +144,7 @@ def improve(
     config: Config, network: Network, shards: Shards, state: TrainState, experience: Experience
 ) -> tuple[TrainState, Metrics]:
     """Learns from all shards, which on a GPU are cut into slices; as `algorithm.improve`."""
-    recurrent, size = is_recurrent(experience.memory), config.num_envs // shards.number
+    recurrent, size = learner.is_recurrent(experience.memory), config.num_envs // shards.number
     number = count_slices(config, size, recurrent, jax.default_backend())
     parts = parts_of(shards, number)
     return algorithm.improve(config, network, state, cut_in_slices(number, experience), parts)

@@ -5,7 +5,6 @@ model. Here numpy computes them, once: JAX would compile a small program for eac
 """
 
 import contextlib
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -97,7 +96,7 @@ _ELEMENTWISE = {
     "and": np.bitwise_and, "or": np.bitwise_or, "not": np.invert,
 }  # fmt: skip
 _RULES: dict[str, Callable[..., np.ndarray]] = {
-    name: functools.partial(lambda f, p, *values: f(*values), function)
+    name: lambda p, *values, function=function: function(*values)
     for name, function in _ELEMENTWISE.items()
 } | {
     "broadcast_in_dim": _broadcast,

@@ -12,7 +12,6 @@ scan that stands still once the loop would have ended. Before each round of a `w
 for the host, which reads the condition. Unlike a `while`, a scan has a reverse-mode derivative.
 """
 
-import functools
 from collections.abc import Iterator, Sequence
 from types import ModuleType
 from typing import Any
@@ -21,8 +20,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.extend import core
 
-from purerl.exact import fused_loops, fused_solves, pallas_calls, walk
-from purerl.exact.constants import is_known
+from purerl.exact import constants, fused_loops, fused_solves, pallas_calls, walk
 from purerl.exact.scatters import gathered_scatter, puts
 from purerl.exact.traces import equations, has_loop, with_own_derivative
 from purerl.exact.walk import Inside, Rule
@@ -60,7 +58,7 @@ def _kernel(module: ModuleType, platform: str) -> Rule:
     """
 
     def replace(eqn: core.JaxprEqn, inputs: Sequence, inside: Inside) -> list:
-        return with_own_derivative(eqn, functools.partial(module.compute, eqn, platform), inputs)
+        return with_own_derivative(eqn, lambda *x: module.compute(eqn, platform, *x), inputs)
 
     return Rule(module.wanted, replace)
 
@@ -131,7 +129,7 @@ def _rounds(params: dict, inputs: Sequence) -> int | None:
     made_by = {v: e for e in body.eqns for v in e.outvars}
     for atom, limit in _limits(test):
         place = test.invars.index(atom) - n if atom in test.invars else -1
-        if place < 0 or not is_known(starts[place]):
+        if place < 0 or not constants.is_known(starts[place]):
             continue
         step = made_by.get(body.outvars[place])
         if step and step.primitive.name == "add" and step.invars[0] is counters[place]:

@@ -21,8 +21,7 @@ import numpy as np
 from jax import Array, lax
 from jax.extend import core
 
-from purerl.exact import pallas_calls
-from purerl.exact.constants import sliced
+from purerl.exact import constants, pallas_calls
 from purerl.exact.traces import CALLS, equations, evaluate, sub_jaxprs
 
 SHORT = 4  # entries of any other axis, at most
@@ -260,7 +259,7 @@ _RULES: dict[str, Callable[..., list[Value]]] = {
     "dynamic_slice": _dynamic_slice,
     "reduce_or": functools.partial(_fold, operator.or_),
     "reduce_sum": _sum,
-    "slice": lambda long, eqn, value: [sliced(eqn.params, value)],
+    "slice": lambda long, eqn, value: [constants.sliced(eqn.params, value)],
     "squeeze": lambda long, eqn, value: [value.reshape(eqn.outvars[0].aval.shape)],
     "stack": lambda long, eqn, *values: [np.stack(values, eqn.params["axis"])],
     **dict.fromkeys(CALLS, lambda long, eqn, *args: _evaluate(long, sub_jaxprs(eqn)[0], *args)),

@@ -12,9 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax.extend import core
 
-from purerl.exact.scatters import ordered_scatter
+from purerl.exact import scatters, walk
 from purerl.exact.traces import equations, source
-from purerl.exact.walk import Rule
 
 _SUMS = ("scatter-add", "scatter_add", "scatter-mul", "scatter_mul", "scatter-sub", "scatter_sub")
 
@@ -55,7 +54,7 @@ def _is_unordered(eqn: core.JaxprEqn) -> bool:
     return sums and jnp.issubdtype(eqn.invars[0].aval.dtype, jnp.inexact)
 
 
-RULE = Rule(_is_unordered, ordered_scatter)
+RULE = walk.Rule(_is_unordered, scatters.ordered_scatter)
 
 
 def check_ordered(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jax import Array
 
 AT_ONCE = 32  # arrays that one kernel copies: each takes registers
@@ -70,7 +69,7 @@ def _copy_kernel(*references: Any) -> None:
     from jax.experimental.pallas import triton
 
     half = len(references) // 2
-    place = pallas.program_id(0) * BLOCK + jnp.arange(BLOCK)
+    place = pallas.program_id(0) * BLOCK + jax.numpy.arange(BLOCK)
     masks = [place < source.shape[0] for source in references[:half]]
     read = [triton.load(x.at[place], mask=m) for x, m in zip(references, masks, strict=False)]
     for result, values, mask in zip(references[half:], read, masks, strict=True):

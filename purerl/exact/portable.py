@@ -14,9 +14,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.extend import core
 
-from purerl.exact.rewriting import traced_anew
-from purerl.exact.traces import CALLS, source, sub_jaxprs
-from purerl.exact.walk import LOOPS, Inside, Rule, rewrite_trace
+from purerl.exact import rewriting, traces, walk
 
 LAPACK = {"lu", "geqrf", "geqp3", "householder_product", "ormqr", "eig", "eigh", "svd"}
 LAPACK |= {"schur", "sylvester", "hessenberg", "tridiagonal", "tridiagonal_solve"}
@@ -31,7 +29,7 @@ def without_libraries(f: Callable) -> Callable:
 
     It raises LibraryError when it is traced, if `f` computes what this module does not know.
     """
-    return traced_anew(f, rewritten)
+    return rewriting.traced_anew(f, rewritten)
 
 
 def rewritten(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
@@ -40,7 +38,7 @@ def rewritten(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
         raise LibraryError(
             f"A library computes {name}, traced at {place}, and its bits follow the processor."
         )
-    return rewrite_trace(closed, [Rule(_wants, _replace)])
+    return walk.rewrite_trace(closed, [walk.Rule(_wants, _replace)])
 
 
 def _beyond(
@@ -48,12 +46,12 @@ def _beyond(
 ) -> Iterator[tuple[str, str]]:
     """Yields what stays with a library, in operations too that no rule goes into, and its place."""
     for eqn in closed.jaxpr.eqns:
-        name, place = eqn.primitive.name, source(eqn)
+        name, place = eqn.primitive.name, traces.source(eqn)
         place = around if around and "/jax/_src/" in place else place
         if name in LAPACK or (name in REPLACED and not (reached and _wants(eqn))):
             yield name, place
-        for sub in sub_jaxprs(eqn):
-            yield from _beyond(sub, place, reached and (name in CALLS or name in LOOPS))
+        for sub in traces.sub_jaxprs(eqn):
+            yield from _beyond(sub, place, reached and (name in traces.CALLS or name in walk.LOOPS))
 
 
 def product(params: dict, left: Array, right: Array) -> Array:
@@ -148,6 +146,6 @@ def _wants(eqn: core.JaxprEqn) -> bool:
     return eqn.primitive.name in REPLACED and real and not eqn.params.get("pivoting")
 
 
-def _replace(eqn: core.JaxprEqn, inputs: Sequence, inside: Inside) -> list[Array]:
+def _replace(eqn: core.JaxprEqn, inputs: Sequence, inside: walk.Inside) -> list[Array]:
     found = REPLACED[eqn.primitive.name](eqn.params, *map(jnp.asarray, inputs))
     return list(found) if eqn.primitive.multiple_results else [found]

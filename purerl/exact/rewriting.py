@@ -7,8 +7,7 @@ from typing import Any
 import jax
 from jax.extend import core
 
-from purerl.exact import fuse as optimisation, order
-from purerl.exact.walk import rewrite_trace
+from purerl.exact import fuse as optimisation, order, walk
 
 
 def rewrite(f: Callable, *, platform: str | None = None, fuse: bool = True) -> Callable:
@@ -31,7 +30,7 @@ def rewrite(f: Callable, *, platform: str | None = None, fuse: bool = True) -> C
 
     def in_order(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
         rules = optimisation.rules(platform or jax.default_backend()) if fuse else []
-        return order.check_ordered(rewrite_trace(closed, [order.RULE, *rules]))
+        return order.check_ordered(walk.rewrite_trace(closed, [order.RULE, *rules]))
 
     return jax.jit(traced_anew(f, in_order), inline=True)
 

@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
@@ -91,7 +90,7 @@ def evaluate(
         literal = isinstance(atom, core.Literal)
         return constant(atom.val, atom.aval.dtype) if literal else values[atom]
 
-    consts = [constant(x, jnp.result_type(x)) for x in closed.consts]
+    consts = [constant(x, jax.numpy.result_type(x)) for x in closed.consts]
     values.update(zip(closed.jaxpr.constvars, consts, strict=True))
     values.update(zip(closed.jaxpr.invars, args, strict=True))
     for eqn in closed.jaxpr.eqns:

@@ -51,8 +51,7 @@ def _run(rules: tuple[Rule, ...], shared: dict, closed: core.ClosedJaxpr, *args:
     inside = functools.partial(_run, rules, shared)
 
     def share(value: np.ndarray) -> Any:
-        content = value.shape, value.dtype.str, value.tobytes()
-        return shared.setdefault(content, value[()])
+        return shared.setdefault((value.shape, value.dtype.str, value.tobytes()), value[()])
 
     def apply(eqn: core.JaxprEqn, *inputs: Any) -> list:
         known = [share(np.asarray(x)) if is_known(x) else None for x in fold(eqn, *inputs)]

@@ -73,12 +73,10 @@ def set_portable_flags() -> None:
     flags = os.environ.get("XLA_FLAGS", "").split()
     for name, value in PORTABLE.items():
         wanted = f"--{name}={value}"
-        users = [flag for flag in flags if flag.partition("=")[0] == f"--{name}"]
-        if any(flag != wanted for flag in users):
-            raise ValueError(
-                f"XLA_FLAGS has {users[0]}; portable bits need {wanted}: leave it out."
-            )
-        flags += [] if users else [wanted]
+        user = [flag for flag in flags if flag.partition("=")[0] == f"--{name}"]
+        if any(flag != wanted for flag in user):
+            raise ValueError(f"XLA_FLAGS has {user[0]}; portable bits need {wanted}: leave it out.")
+        flags += [] if user else [wanted]
     os.environ |= {"XLA_FLAGS": " ".join(flags), "NPROC": "1"}
 
 

@@ -17,8 +17,7 @@ from purerl.experiment import other_trainers, settings_json
 from purerl.experiment.definition import Experiment, shrunk
 from purerl.experiment.loading import Source, available, find_source, summary
 from purerl.experiment.options import RunOptions
-from purerl.machine import output
-from purerl.machine.command_errors import tell
+from purerl.machine import command_errors, output
 
 CONFIG = (tyro.conf.FlagCreatePairsOff,)
 # A flag takes a word, True or False, as every other option does.
@@ -63,7 +62,7 @@ def _main(run: Callable[[list[str]], int | None]) -> Callable[..., int]:
         try:
             return run(sys.argv[1:] if arguments is None else list(arguments)) or SUCCESS
         except (UserError, RunError, StoppedError) as error:
-            return tell(error)
+            return command_errors.tell(error)
 
     return main
 
@@ -170,29 +169,25 @@ def _words(name: str, value: Any) -> list[str]:
 
 
 def parse(
-    kind: Any,
-    arguments: Sequence[str],
-    prog: str,
-    default: Any = None,
-    config: Any = CONFIG,
-    **more: Any,
+    kind: Any, words: Sequence[str], prog: str, base: Any = None, config: Any = CONFIG, **more: Any
 ) -> Any:
     """Parses a command line into the dataclass `kind`; `--help` prints a page and exits.
 
-    `more` is for `tyro.cli`, such as `return_unknown_args=True`.
+    What the words do not give is as in `base`; `more` is for `tyro.cli`, such as
+    `return_unknown_args=True`.
 
     Raises:
       UserError: there is no such option (the message has the nearest one), or a value is wrong.
     """
     said = io.StringIO()
-    extra = {} if default is None else {"default": default}
+    extra = {} if base is None else {"default": base}
     try:
         with output.answering(), contextlib.redirect_stderr(said):
-            return tyro.cli(kind, args=list(arguments), prog=prog, config=config, **extra, **more)
+            return tyro.cli(kind, args=list(words), prog=prog, config=config, **extra, **more)
     except SystemExit as error:
         if not error.code:
             raise
-        what = _one_line(said.getvalue(), _option_names(kind, default))
+        what = _one_line(said.getvalue(), _option_names(kind, base))
         raise UserError(f"{what} All options: {prog} --help") from error
 
 
@@ -209,9 +204,8 @@ def _one_line(text: str, names: list[str]) -> str:
             return f"{unknown[1]} takes no value; --{group}{dot}no-{name} turns it off."
         if not unknown[1].startswith("-"):
             return f"{unknown[1]!r} follows no option; write one before it, as in --name x."
-        return (
-            f"There is no option {unknown[1]}. {other_trainers.suggest(unknown[1], names)}".strip()
-        )
+        hint = other_trainers.suggest(unknown[1], names)
+        return f"There is no option {unknown[1]}. {hint}".strip()
     titles = "Value error|Missing argument|Invalid choice|Parsing error|Required options"
     plain = re.sub(rf"^({titles}) ", "", plain)
     plain = re.sub(r" *(Argument helptext:|For full helptext).*", "", plain)

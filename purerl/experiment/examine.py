@@ -8,15 +8,13 @@ from typing import Any
 
 import jax
 
-from purerl.checks import examine_env, examine_network
+from purerl.checks import examine_env, examine_network, user_code
 from purerl.checks.findings import Finding, error, ok, warning
-from purerl.checks.user_code import users_errors
 from purerl.core.env import State
 from purerl.core.errors import UserError
 from purerl.core.records import PyTree
-from purerl.devices import memory
+from purerl.devices import memory, shards
 from purerl.devices.programs import abstract_state, compile_programs
-from purerl.devices.shards import Shards
 from purerl.experiment.definition import Experiment
 from purerl.experiment.objects import Setup, build, naming_broken_rules
 from purerl.ppo.config import Config, Evaluation
@@ -42,7 +40,7 @@ def examine(chosen: Experiment, speed: bool) -> Iterator[Finding]:
     except UserError as broken:
         yield error("build", str(broken))
         return
-    with users_errors(""), naming_broken_rules(setup.env):
+    with user_code.users_errors(""), naming_broken_rules(setup.env):
         abstract = abstract_state(*setup[:3])
     yield ok("build", f"{type(setup.env).__name__}, engine {setup.engine}")
     found = [check_memory(setup, abstract), check_minibatch(setup, abstract)]
@@ -53,7 +51,7 @@ def examine(chosen: Experiment, speed: bool) -> Iterator[Finding]:
         yield finding
     if any(one.level == "error" for one in [*found, *env_found]):
         return  # what follows would fail by the same, or fill the memory
-    with users_errors("The network: "):
+    with user_code.users_errors("The network: "):
         few = _starts(setup, min(setup.config.num_envs, OBSERVATIONS))
         yield from examine_network.examine(setup.network, few.observation)
     if speed:
@@ -105,8 +103,7 @@ def check_settings(config: Config) -> Iterator[Finding]:
 
 def _starts(setup: Setup, number: int) -> State:
     """Returns fresh environments."""
-    keys = jax.random.split(jax.random.key(0), number)
-    return jax.jit(jax.vmap(setup.env.reset))(keys)
+    return jax.jit(jax.vmap(setup.env.reset))(jax.random.split(jax.random.key(0), number))
 
 
 def _speeds(setup: Setup, start: State) -> Iterator[Finding]:
@@ -133,7 +130,7 @@ def _speeds(setup: Setup, start: State) -> Iterator[Finding]:
     short = setup._replace(config=dataclasses.replace(config, rollout_length=length))
     with naming_broken_rules(env):
         programs = compile_programs(
-            *short[:3], Evaluation(number=0), True, Shards(), calls_host=setup.engine == "c"
+            *short[:3], Evaluation(number=0), True, shards.Shards(), calls_host=setup.engine == "c"
         )
     states = [programs.init(jax.random.key(0))]
 

@@ -12,10 +12,9 @@ from typing import NamedTuple
 
 import purerl
 from purerl.core.errors import UserError, one_line, unknown_name
+from purerl.experiment import kinds, source_hashes
 from purerl.experiment.definition import Experiment
-from purerl.experiment.kinds import suggest_field, wrong_value
 from purerl.experiment.settings_json import has_settings, to_json
-from purerl.experiment.source_hashes import forget_edited, imported_files
 from purerl.machine.files import read_bytes
 from purerl.ppo.config import Config, Evaluation
 
@@ -132,16 +131,16 @@ def load_file(
             "that has to work alone: import by the full name."
         )
     with _mistakes(str(path), place, of_run):
-        forget_edited(module_name)
+        source_hashes.forget_edited(module_name)
         exec(compile(text, str(path), "exec", dont_inherit=True), module.__dict__)
-        imported_files([module_name])  # what it has imported is what it is hashed by
+        source_hashes.imported_files([module_name])  # what it has imported is what it is hashed by
     if not isinstance(found := getattr(module, "experiment", None), Experiment):
         raise UserError(f"{path} defines no `experiment = Experiment(...)` (it is {found!r}).")
     for field in ("env", "network", "ppo", "evaluation"):
         if not has_settings(value := getattr(found, field)):
             raise UserError(f"{path}: {field} is {value!r}; it must be a frozen dataclass's value.")
         to_json(value, field)  # here, or the command line would meet what it cannot hold
-    if wrong := wrong_value(found):
+    if wrong := kinds.wrong_value(found):
         raise UserError(f"{path}: {wrong}")
     return Source(found, name or path.stem, path, text)
 
@@ -177,8 +176,8 @@ def _mistakes(file: str, place: Path, of_run: bool) -> Iterator[None]:
             hint += ". The run was made by an older purerl: train it anew."
         from purerl.ppo.networks import MlpOptions, RecurrentOptions  # here, as it starts JAX
 
-        kinds = (Config, Evaluation, Experiment, MlpOptions, RecurrentOptions)
-        hint = hint or suggest_field(str(error), *kinds)
+        known = (Config, Evaluation, Experiment, MlpOptions, RecurrentOptions)
+        hint = hint or kinds.suggest_field(str(error), *known)
         said = re.sub(r"('purerl[.\w]*') \(.*\)$", r"\1", one_line(error))
         raise UserError(f"{file}{where}: {said}{hint}") from error
 

@@ -4,7 +4,6 @@ import errno
 import keyword
 import os
 import shutil
-import tempfile
 from pathlib import Path
 
 from purerl.core.errors import UserError
@@ -54,19 +53,12 @@ def _files() -> dict[str, str]:
 
 def _write_whole(folder: Path, files: dict[str, str]) -> None:
     """Writes into a folder beside it first, so that nothing half made stands under its name."""
-    draft = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.absolute().parent))
+    draft = folder.absolute().with_name(f".{folder.name}-{os.urandom(4).hex()}")
+    draft.mkdir()
     try:
         for name, text in files.items():
             (draft / name).write_text(text)
-        draft.chmod(0o777 & ~_umask())  # a temporary folder is its owner's alone
         draft.rename(folder.absolute())
     except BaseException:
         shutil.rmtree(draft, ignore_errors=True)
         raise
-
-
-def _umask() -> int:
-    """Returns the process's file mode mask, which can be read only by setting it."""
-    mask = os.umask(0o077)
-    os.umask(mask)
-    return mask

@@ -6,17 +6,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from purerl.checks.check_env import check_fields, check_members, check_shapes, shapes_of_reset
-from purerl.checks.check_traces import difference, trace_anew
+from purerl.checks import check_env, check_traces
 from purerl.checks.user_code import check_takes, users_errors
 from purerl.core.env import Env, EnvError
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.records import Network, PolicyOutput, PyTree
-from purerl.devices import memory, threads
+from purerl.devices import memory, programs, threads
 from purerl.devices.check_sizes import check_minibatches
-from purerl.devices.programs import abstract_state
 from purerl.experiment import settings_json
 from purerl.experiment.definition import Experiment
 from purerl.experiment.kinds import wrong_value
@@ -52,10 +49,10 @@ def build(chosen: Experiment) -> Setup:
         raise UserError("build_env returned None: its last line must return the environment.")
     about = f"The environment {type(env).__name__}: "
     with users_errors(""):
-        check_members(env)
+        check_env.check_members(env)
     with users_errors(about):
-        state = shapes_of_reset(env)
-        check_fields(state)
+        state = check_env.shapes_of_reset(env)
+        check_env.check_fields(state)
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state.observation)
     with users_errors("build_network: "):
         network = chosen.build_network(chosen.network, zeros, env.action_size)
@@ -64,7 +61,7 @@ def build(chosen: Experiment) -> Setup:
     setup = Setup(chosen.ppo, env, in_float32(network), engine)
     with users_errors(""), naming_broken_rules(env):
         # Sizes that do not fit together show here, in a second.
-        abstract = abstract_state(*setup[:3])
+        abstract = programs.abstract_state(*setup[:3])
         check_minibatches(setup.config, is_recurrent(abstract.memory), setup.config.num_envs)
     return setup
 
@@ -87,7 +84,7 @@ def check_acts(chosen: Experiment, before: dict[str, Any], env: Env, abstract: P
     def trace(settings: Any) -> Any:
         options = settings_json.from_json(chosen.network, settings)
         network = chosen.build_network(options, example, env.action_size)
-        return trace_anew(network.apply, abstract.params, seen, abstract.memory)
+        return check_traces.trace_anew(network.apply, abstract.params, seen, abstract.memory)
 
     now, old = settings_json.to_json(chosen.network), before["network"]
     idle = ["seed"] * (before["seed"] != chosen.seed)
@@ -96,7 +93,7 @@ def check_acts(chosen: Experiment, before: dict[str, Any], env: Env, abstract: P
     for name in now if isinstance(now, dict) and isinstance(old, dict) else ():
         if old.get(name, now[name]) != now[name]:
             with contextlib.suppress(Exception):  # the code of today refuses what was: it acts
-                if difference(trace(now | {name: old[name]}), trace(now)) is None:
+                if check_traces.difference(trace(now | {name: old[name]}), trace(now)) is None:
                     idle.append(f"network.{name}")
     if idle:
         raise UserError(
@@ -146,11 +143,9 @@ def _check_network(network: Network, observation: PyTree, action_size: int) -> N
                 "`apply`."
             )
     _check_memory_starts_at_zero(network, carry)
-    batch = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct((2, *x.shape), x.dtype), (observation, carry)
-    )
+    two = jax.tree.map(lambda x: jax.ShapeDtypeStruct((2, *x.shape), x.dtype), (observation, carry))
     said = "apply(params, observation, memory)"
-    output, following = _pair(said, "a purerl.PolicyOutput", network.apply, params, *batch)
+    output, following = _pair(said, "a purerl.PolicyOutput", network.apply, params, *two)
     if not isinstance(output, PolicyOutput):
         raise ValueError(
             f"The network's `apply` returned a {type(output).__name__} and a memory; it must be "
@@ -167,7 +162,7 @@ def _check_network(network: Network, observation: PyTree, action_size: int) -> N
                 f"The network's {name} is {list(answer.shape)} for 2 observations and "
                 f"{action_size} actions; it must be {list(shape)}."
             )
-    kinds = [jax.tree.map(lambda x: (x.shape, x.dtype), tree) for tree in (batch[1], following)]
+    kinds = [jax.tree.map(lambda x: (x.shape, x.dtype), tree) for tree in (two[1], following)]
     if kinds[0] != kinds[1]:
         raise ValueError(
             f"The network's memory goes in as {kinds[0]} and comes back as {kinds[1]}, for 2 "
@@ -192,7 +187,7 @@ def _check_memory_starts_at_zero(network: Network, carry: PyTree) -> None:
     """Raises ValueError unless `init` gives a memory of zeros, with which every episode starts."""
     if jax.tree.leaves(carry):
         memory = jax.jit(lambda key: network.init(key)[1])(jax.random.key(0))
-        if any(np.asarray(x).any() for x in jax.tree.leaves(memory)):
+        if any(jnp.any(x) for x in jax.tree.leaves(memory)):
             raise ValueError(
                 "The network's memory starts as other numbers than 0, and every episode starts "
                 "with zeros: return zeros from `init`, and add the rest in `apply`."
@@ -223,7 +218,7 @@ def naming_broken_rules(env: Env) -> Iterator[None]:
         raise
     except Exception as error:
         try:
-            check_shapes(env)
+            check_env.check_shapes(env)
         except EnvError as broken:
             what = one_line(broken)
             raise UserError(f"The environment {type(env).__name__}: {what}") from error

@@ -59,10 +59,8 @@ def from_json(template: Any, values: Any, path: str = "") -> Any:
             kind, given = kinds.get(name, Any), values[name]
             if not fits(kind, given) and given != (like := to_json(value)):
                 must = f"{inspect.formatannotation(kind)}, such as {like!r}"
-                where = _join(path, name)
-                raise UserError(
-                    f"config.json: {where} is {reprlib.repr(given)}; it must be {must}."
-                )
+                said = f"{_join(path, name)} is {reprlib.repr(given)}; it must be {must}."
+                raise UserError(f"config.json: {said}")
         try:
             read = {n: from_json(value, values[n], _join(path, n)) for n, value in known.items()}
             return dataclasses.replace(template, **read)
@@ -95,6 +93,5 @@ def _check_names(names: list[str], values: Any, path: str) -> None:
     for name in sorted(set(names).symmetric_difference(values)):
         if name in names:
             raise UserError(f"config.json lacks {_join(path, name)}, which the experiment has.")
-        valid = [_join(path, n) for n in names]
-        what = unknown_name("setting", _join(path, name), valid)
+        what = unknown_name("setting", _join(path, name), [_join(path, n) for n in names])
         raise UserError(f"config.json: {what} The code may be of another version.")

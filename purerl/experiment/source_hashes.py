@@ -23,14 +23,8 @@ PACKAGE = Path(__file__).parent.parent
 # Rooms, and modules of other rooms, that no program is traced from. They prepare a run, look after
 # it or look at it. The modules of rooms that compute only raise errors or word them.
 LEFT_OUT = {"checks", "experiment", "machine", "report", "runs", "training", "tune"}
-LEFT_OUT |= {
-    "adapters.to_gymnasium",
-    "core.errors",
-    "devices.check_sizes",
-    "devices.memory",
-    "devices.processes",
-    "ppo.checks",
-}
+LEFT_OUT |= {"adapters.to_gymnasium", "core.errors", "ppo.checks"}
+LEFT_OUT |= {"devices.check_sizes", "devices.memory", "devices.processes"}
 
 # Environments and experiments count where they are imported, as a person's own do.
 IMPORTED = {"envs", "experiments", "assets"}
@@ -232,11 +226,8 @@ def _is_stale(name: str, file: Path, known: dict[Path, tuple[Any, bytes]]) -> bo
         then, now = known[file][1], file.read_bytes() if file.exists() else b""
         return then != now and hash_code(then) != hash_code(now)
     # Who imported it before may have edited it since.
-    return (
-        name in sys.modules
-        and name.partition(".")[0] != PACKAGE.name
-        and file.stat().st_mtime > _BEGIN
-    )
+    is_own = name in sys.modules and name.partition(".")[0] != PACKAGE.name
+    return is_own and file.stat().st_mtime > _BEGIN
 
 
 def _imports(module: str, file: Path) -> list[str]:

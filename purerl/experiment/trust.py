@@ -14,11 +14,10 @@ from pathlib import Path
 
 from purerl.core.errors import UserError
 from purerl.experiment import loading
-from purerl.experiment.loading import Source
 from purerl.machine.files import check_inside, read_bytes
 
 
-def load_copy(copy: Path, text: bytes, name: str, original: Path, trust: bool) -> Source:
+def load_copy(copy: Path, text: bytes, name: str, original: Path, trust: bool) -> loading.Source:
     """Executes a run's copy of its experiment.
 
     Args:

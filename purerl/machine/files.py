@@ -22,7 +22,7 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, get_args
 
-from purerl.core.errors import UserError, one_line
+from purerl.core.errors import UserError, one_line, reason
 from purerl.machine.output import printable
 
 LARGEST = 16 << 20  # [bytes] of a JSON file
@@ -113,11 +113,6 @@ def parse(where: str, text: bytes) -> Any:
         if not level:
             return value
     raise UserError(f"{where} is nested more than {DEEPEST} deep, which no file of a run is.")
-
-
-def reason(error: BaseException) -> str:
-    """Returns why a file could not be read or written, in a few words."""
-    return getattr(error, "strerror", None) or one_line(error)
 
 
 # --- writing ---

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from purerl.core.errors import RunError
+from purerl.core.errors import RunError, reason
 
 Say = Callable[[str], None]  # prints a line
 REFUSALS = (OSError, ValueError)  # the latter of a stream that Python has closed
@@ -44,7 +44,7 @@ def answering() -> Iterator[None]:
         discard(sys.stdout)
         if isinstance(error, BrokenPipeError):
             raise
-        raise RunError(f"Standard output cannot be written: {_reason(error)}.") from error
+        raise RunError(f"Standard output cannot be written: {reason(error)}.") from error
 
 
 def show(*lines: str) -> None:
@@ -99,18 +99,14 @@ class Guarded:
         try:
             function(*arguments)
         except REFUSALS as error:
-            _tell_of_loss(_reason(error))
+            _tell_of_loss(reason(error))
             if isinstance(error, BrokenPipeError):  # no reader will come back
                 discard(self.stream)
 
 
 @functools.cache
-def _tell_of_loss(reason: str) -> None:
-    warn(f"purerl: Standard output cannot be written: {reason}. Training goes on without it.")
-
-
-def _reason(error: Exception) -> str:
-    return getattr(error, "strerror", None) or str(error)
+def _tell_of_loss(why: str) -> None:
+    warn(f"purerl: Standard output cannot be written: {why}. Training goes on without it.")
 
 
 def flush_or_drop(stream: Any) -> None:

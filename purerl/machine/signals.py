@@ -26,8 +26,7 @@ def stop_signals(
             end(128 + number)
             return
         received.append(number)
-        name = signal.Signals(number).name
-        output.warn(f"\n{name}: {then}. Once more to stop at once.")
+        output.warn(f"\n{signal.Signals(number).name}: {then}. Once more to stop at once.")
 
     in_main = threading.current_thread() is threading.main_thread()
     with handling((signal.SIGTERM, signal.SIGINT) if in_main else (), handle):

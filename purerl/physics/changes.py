@@ -1,53 +1,101 @@
-"""Fields of a model that differ between simulations: which may, what follows, what cannot act."""
+"""Fields of a model that differ between simulations: which may, what follows, what cannot act.
+
+Constants that MuJoCo derives from fields are computed anew where those have changed: `derive`. A
+model that was edited after its Physics was built, and rotations of zeros, are mistakes that no
+engine would tell.
+"""
 
 import contextlib
 import copy
+import functools
+import operator
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from mujoco.batch import Batch, SimulationError
 
 from purerl.core.errors import unknown_name
 from purerl.core.records import Array
+from purerl.physics import host_calls, lookup, reasons
 from purerl.physics.left_out import LEFT_OUT
 
-# Fields of MjModel that may differ between environments, on every engine: a test compares them with
-# those that MJX traces, so that the `c` engine need not import MJX, which takes seconds.
+# Floats of MjModel that are of no one simulation (of meshes, of users), or that MJX does not trace.
+_ONE_FOR_ALL = re.compile(
+    "(bvh|efm0|flex|flexedge|hfield|key|mesh|numeric|oct|sensor|skin|tuple|wrap)_.*|.*_user|"
+    "actuator_(armature|damping|dampingpoly|delay|length0)|body_margin|cam_(ipd|sensorsize)|"
+    "dof_length|geom_(adhesion|fluid|surfacevel)|light_(bulbradius|intensity|range|softness)|"
+    "mat_(metallic|reflectance|roughness|texrepeat)|pair_adhesion|site_(rgba|size)|"
+    "tendon_(rgba|width)"
+)
+_NO_MODEL = mujoco.MjModel.from_xml_string("<mujoco/>")
+# Fields that may differ between environments, on every engine: a test compares them with those that
+# MJX traces, so that the `c` engine need not import MJX, which takes seconds.
 CHANGEABLE_FIELDS = tuple(
-    """
-    actuator_acc0 actuator_actrange actuator_biasprm actuator_cranklength actuator_ctrlrange
-    actuator_dynprm actuator_forcerange actuator_gainprm actuator_gear actuator_lengthrange
-    body_gravcomp body_inertia body_invweight0 body_ipos body_iquat body_mass body_pos body_quat
-    body_subtreemass cam_fovy cam_intrinsic cam_mat0 cam_pos cam_pos0 cam_poscom0 cam_quat dof_M0
-    dof_armature dof_damping dof_dampingpoly dof_frictionloss dof_invweight0 dof_solimp dof_solref
-    eq_data eq_solimp eq_solref geom_aabb geom_friction geom_gap geom_margin geom_pos geom_quat
-    geom_rbound geom_rgba geom_size geom_solimp geom_solmix geom_solref jnt_actfrcrange jnt_axis
-    jnt_margin jnt_pos jnt_range jnt_solimp jnt_solref jnt_stiffness jnt_stiffnesspoly
-    light_ambient light_attenuation light_cutoff light_diffuse light_dir light_dir0 light_exponent
-    light_pos light_pos0 light_poscom0 light_specular mat_emission mat_rgba mat_shininess
-    mat_specular pair_friction pair_gap pair_margin pair_solimp pair_solref pair_solreffriction
-    qpos0 qpos_spring site_pos site_quat tendon_actfrcrange tendon_armature tendon_damping
-    tendon_dampingpoly tendon_frictionloss tendon_invweight0 tendon_length0 tendon_lengthspring
-    tendon_margin tendon_range tendon_solimp_fri tendon_solimp_lim tendon_solref_fri
-    tendon_solref_lim tendon_stiffness tendon_stiffnesspoly
-    """.split()  # noqa: SIM905
+    name
+    for name in dir(_NO_MODEL)
+    if getattr(getattr(_NO_MODEL, name), "dtype", int) in (np.float32, np.float64)
+    and not _ONE_FOR_ALL.fullmatch(name)
 )
 
 # Those of them that mj_setConst derives from others, and those that the compiler alone does.
-CONSTANTS = """
-body_subtreemass body_invweight0 dof_invweight0 dof_M0 tendon_length0 tendon_invweight0
-actuator_acc0 eq_data geom_rbound geom_aabb cam_pos0 cam_poscom0 cam_mat0 light_pos0 light_poscom0
-light_dir0
-""".split()  # noqa: SIM905
+_DERIVED = [name for name in mujoco.MjModel._setconst_outputs if name != "geom_size"]
+CONSTANTS = [name for name in _DERIVED if name in CHANGEABLE_FIELDS]
 _COMPILED = ("tendon_lengthspring", "actuator_lengthrange")
 # Ends of names, and of the field without which those do nothing: jnt_range, jnt_limited.
 _SWITCHES = {r"(range|margin|solref|solimp)(_lim)?$": "limited", r"(dyn|bias)prm$": r"\1type"}
 _TRACKING = [int(getattr(mujoco.mjtCamLight, f"mjCAMLIGHT_{x}")) for x in ("TRACK", "TRACKCOM")]
+_DRAWN = ("light_", "cam_", "mat_", "geom_rgba")  # what one edits to draw
+ZERO_ROTATION = (
+    "A simulation starts with a quaternion of zeros, in qpos of a free or ball joint or in "
+    "body_quat, which is no rotation: write 1 0 0 0 for none, as model.qpos0 has it."
+)
 Follows = Callable[[str], dict[str, np.ndarray]]  # `consequences` of a field, kept
+
+
+def numbers(model: mujoco.MjModel, fields: Iterable[str]) -> dict[str, Any]:
+    """Returns copies of all options and of those `fields` that are not only drawn."""
+    names = [f"opt.{name}" for name in dir(model.opt) if not name.startswith("_")]
+    names += [name for name in fields if not name.startswith(_DRAWN)]
+    return {name: np.copy(operator.attrgetter(name)(model)) for name in names}
+
+
+def check_unedited(model: mujoco.MjModel, built: dict[str, Any]) -> None:
+    """Raises ValueError for a model whose `numbers` are no more those that an engine has."""
+    for name, value in built.items():
+        if not np.array_equal(value, operator.attrgetter(name)(model)):
+            raise ValueError(
+                f"The model's {name} was edited after its Physics was built, which has no effect: "
+                "edit the model before, or build another Physics of a copy (copy.copy(model)); "
+                "what differs between simulations goes into changes=."
+            )
+
+
+def refuse_zero_rotations(model: mujoco.MjModel, qpos: Array, changes: dict[str, Array]) -> Array:
+    """Raises ValueError for quaternions of zeros; returns qpos [nq].
+
+    Where only a program will know them, it is NaN then. MuJoCo takes them for no rotation, MJX for
+    NaN, MJX-Warp for half a turn.
+    """
+    given: Any = qpos if isinstance(qpos, jax.core.Tracer) else np.asarray(qpos)
+    zero = has_zero_rotation(model, given, changes)
+    if isinstance(zero, jax.core.Tracer):
+        return jnp.where(zero, jnp.nan, qpos)
+    if zero:
+        raise ValueError(ZERO_ROTATION)
+    return qpos
+
+
+def has_zero_rotation(model: mujoco.MjModel, qpos: Array, changes: dict[str, Array]) -> Any:
+    """Tells whether qpos [nq], or a changed body_quat, has a quaternion of zeros, [] bool."""
+    kinds = (mujoco.mjtJoint.mjJNT_FREE, 3), (mujoco.mjtJoint.mjJNT_BALL, 0)
+    starts = [i + skip for kind, skip in kinds for i in model.jnt_qposadr[model.jnt_type == kind]]
+    quats = [*(qpos[i : i + 4] for i in starts), *changes.get("body_quat", ())]
+    return sum((quat == 0).all() for quat in quats) > 0
 
 
 def check_fields(model: mujoco.MjModel, engine: str, changes: dict[str, Any]) -> None:
@@ -166,3 +214,36 @@ def check_shape(name: str, value: Any, shape: tuple[int, ...]) -> None:
             f"{name} has shape {jnp.shape(value)}; one simulation of this model takes {shape}. "
             "Batches are the caller's vmap."
         )
+
+
+def derive(
+    model: mujoco.MjModel, changes: dict[str, Any], wanted: tuple[str, ...]
+) -> dict[str, Array]:
+    """Returns the `wanted` constants of a model with changes: by mj_setConst, on the host."""
+    names = tuple(sorted(changes))
+    name = "-".join(["purerl-derive", lookup.hash_model(model, wanted), *names])
+    host = functools.partial(_derive_rows, copy.copy(model), names, wanted)
+    shapes = [getattr(model, n).shape for n in wanted]
+    found = host_calls.run(name, host, [changes[n] for n in names], shapes)
+    return dict(zip(wanted, found, strict=True))
+
+
+def _derive_rows(
+    model: mujoco.MjModel, names: tuple[str, ...], wanted: tuple[str, ...], rows: Any
+) -> np.ndarray:
+    """Derives packed rows: [..., changes] -> [..., constants]; NaN where MuJoCo refuses."""
+    flat = np.asarray(rows).reshape(-1, np.shape(rows)[-1])
+    batch = Batch(model, len(flat), nthread=host_calls.usable_cores())
+    fields = [batch.expand(name) for name in names]
+    host_calls.unpack(fields, flat)
+    for name, field in zip(names, fields, strict=True):
+        if name in ("body_pos", "body_quat"):  # a mocap body is where the state says
+            field[:, model.body_mocapid >= 0] = getattr(model, name)[model.body_mocapid >= 0]
+    with contextlib.suppress(SimulationError):  # `status` says which
+        batch.set_const()
+    for i in np.flatnonzero(batch.status):
+        reasons.note(batch.error(int(i)))
+    found = [batch.expand(name).reshape(len(flat), -1) for name in wanted]
+    out = np.concatenate(found, axis=1, dtype=np.float32)
+    out[batch.status != 0] = np.nan
+    return out.reshape(*np.shape(rows)[:-1], out.shape[-1])

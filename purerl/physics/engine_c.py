@@ -7,7 +7,6 @@ arguments, which is what `jax.pure_callback` and `host_calls` ask for.
 
 import copy
 import functools
-import math
 import threading
 from typing import Any, NamedTuple
 
@@ -18,12 +17,9 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from purerl.core.records import Array, PyTree
-from purerl.physics import host_calls, reasons
-from purerl.physics.lookup import hash_model
+from purerl.physics import host_calls, lookup, reasons
 
-_BLOWN_UP = [
-    int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{x}")) for x in ("QPOS", "QVEL", "QACC", "CTRL")
-]
+_BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{x}")) for x in ("QPOS", "QVEL", "QACC", "CTRL")]
 # Contacts or constraints that MuJoCo left out, as the model's memory was full.
 _FULL = [int(getattr(mujoco.mjtWarning, f"mjWARN_{x}FULL")) for x in ("CONTACT", "CNSTR")]
 
@@ -44,9 +40,8 @@ class CEngine:
         self.model, self.record = copy.copy(model), record
         self.stage, self.substeps = stage, substeps
         # All that results depend on, but what is asked of a call.
-        self.name = f"purerl-{hash_model(self.model, (*record._fields, stage))}"
-        data = mujoco.MjData(model)
-        self.shapes = [np.shape(getattr(data, name, 0.0)) for name in record._fields]
+        self.name = f"purerl-{lookup.hash_model(self.model, (*record._fields, stage))}"
+        self.shapes = list(lookup.reading_shapes(model, record._fields).values())
         self.rows: dict[tuple, Rows] = {}  # by number, fields and changed fields
         # XLA may run the callbacks of independent programs on several threads at once.
         self.lock = threading.Lock()
@@ -68,10 +63,9 @@ class CEngine:
         fields = tuple(state.__dataclass_fields__)
         host = functools.partial(_run_rows, self, fields, names, substeps)
         name = "-".join([self.name, str(substeps), *fields, *names])
-        shapes = [leaf.shape for leaf in leaves] + self.shapes
-        out = host_calls.run(name, host, given, shapes)
+        out = host_calls.run(name, host, given, [leaf.shape for leaf in leaves] + self.shapes)
         state = jax.tree.unflatten(structure, out[: len(leaves)])
-        return state, self.record(*map(_as_matrix, self.record._fields, out[len(leaves) :]))
+        return state, self.record(*out[len(leaves) :])
 
     def rows_of(self, number: int, fields: tuple[str, ...], names: tuple[str, ...]) -> "Rows":
         """Returns the simulations of `number` environments, and where their packed rows go."""
@@ -108,11 +102,6 @@ def _movable(model: mujoco.MjModel, names: tuple[str, ...]) -> mujoco.MjModel:
     return model
 
 
-def _as_matrix(name: str, value: Array) -> Array:
-    """Rotation matrices are [n, 3, 3], as on the other engines; MuJoCo keeps rows of 9."""
-    return value.reshape(-1, 3, 3) if name.endswith("mat") else value
-
-
 def _run_rows(
     engine: CEngine, fields: tuple[str, ...], names: tuple[str, ...], substeps: int, rows: Any
 ) -> np.ndarray:
@@ -132,7 +121,7 @@ def _run_rows(
         full[:] = (batch.warning[:, _FULL, 1] > 0).any(axis=1)
         if "overflow" not in engine.record._fields:
             bad |= full > 0  # nobody looks
-        read = [source.reshape(len(flat), math.prod(source.shape[1:])) for source in sources]
+        read = [source.reshape(len(flat), source[0].size) for source in sources]
         out = np.concatenate(read, axis=1, dtype=np.float32)
     out[bad] = np.nan
     return out.reshape(*rows.shape[:-1], out.shape[-1])
@@ -165,4 +154,4 @@ def _advance(batch: Batch, stage: int, substeps: int) -> np.ndarray:
     for i in np.flatnonzero(batch.status):
         reasons.note(batch.error(int(i)))
     # MuJoCo answers a blow-up with a warning and a silent reset of that simulation.
-    return (batch.status != 0) | (batch.warning[:, _BLOWN_UP, 1] > 0).any(axis=1)
+    return (batch.status != 0) | (batch.warning[:, _BAD, 1] > 0).any(axis=1)

@@ -8,10 +8,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 
 from purerl import exact
 from purerl.core.records import Array, PyTree
+from purerl.physics.lookup import reading_shapes
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that warp, which is optional, is absent
     from mujoco import mjx
@@ -117,14 +117,6 @@ def _hint(model: mujoco.MjModel) -> str:
     """Tells what MJX's own words do not."""
     rays = (model.sensor_type == mujoco.mjtSensor.mjSENS_RANGEFINDER).any()
     return " (a rangefinder needs a <material> in it)" if rays and not model.nmat else ""
-
-
-def reading_shapes(model: mujoco.MjModel, names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
-    """Returns each reading's shape; rotation matrices are [n, 3, 3] on every engine."""
-    data = mujoco.MjData(model)
-    shapes = {name: np.shape(getattr(data, name)) for name in names}
-    matrices = ("xmat", "ximat", "geom_xmat", "site_xmat", "cam_xmat")
-    return {n: (s[0], 3, 3) if n in matrices else s for n, s in shapes.items()}
 
 
 def mjx_defaults() -> contextlib.ExitStack:

@@ -30,7 +30,8 @@ from mujoco.mjx.third_party import mujoco_warp as mjw  # noqa: E402
 from purerl.core.errors import unknown_name  # noqa: E402
 from purerl.core.records import Array, PyTree  # noqa: E402
 from purerl.physics.changes import CONSTANTS  # noqa: E402
-from purerl.physics.engine_mjx import mjx_defaults, reading_shapes  # noqa: E402
+from purerl.physics.engine_mjx import mjx_defaults  # noqa: E402
+from purerl.physics.lookup import reading_shapes  # noqa: E402
 from purerl.physics.warp_buffers import Batch, Shapes, Stage, make_call, put_model, room  # noqa: E402
 
 # Running out of iterations is the solver's setting; everything else drops something.
@@ -118,13 +119,9 @@ class WarpEngine:
         size, changed = state.time.shape[0], tuple(sorted(changes))
         if (name, size, changed) not in self.calls:
             takes = {field: value.shape[1:] for field, value in given.items()}
-            self.calls[name, size, changed] = make_call(
-                name,
-                self._stages(name, takes),
-                takes,
-                size,
-                lambda on: self._batch(on, size, changed),
-            )
+            batch = functools.partial(self._batch, size=size, changed=changed)
+            call = make_call(name, self._stages(name, takes), takes, size, batch)
+            self.calls[name, size, changed] = call
         return self.calls[name, size, changed](given)
 
     def _stages(self, name: str, takes: Shapes) -> tuple[Stage, Stage]:
@@ -263,8 +260,7 @@ def _over_batch(function: Callable, axes: int = 0) -> Callable:
         lead = args[0].time.shape
         number = math.prod(lead)
         flat = jax.tree.map(lambda x: x.reshape(number, *x.shape[axes:]), args)
-        out = function(*flat)
-        return jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), out)
+        return jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), function(*flat))
 
     @call.def_vmap
     def add_axis(size: int, batched: list, *args: PyTree) -> tuple[PyTree, PyTree]:

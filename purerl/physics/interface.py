@@ -15,16 +15,7 @@ from flax import struct
 import purerl
 from purerl.core.errors import unknown_name
 from purerl.core.records import Array, PyTree
-from purerl.physics.as_built import check_unedited, numbers, refuse_zero_rotations
-from purerl.physics.changes import (
-    CHANGEABLE_FIELDS,
-    CONSTANTS,
-    check_fields,
-    check_shape,
-    check_whole,
-    consequences,
-)
-from purerl.physics.left_out import check_left_out
+from purerl.physics import changes as fields, left_out
 
 ENGINES = ("auto", "c", "jax", "warp")
 
@@ -120,13 +111,14 @@ class Physics:
         readings = (readings,) if isinstance(readings, str) else tuple(readings)
         self.engine = choose_engine(engine)
         _check_model(model, tuple(n for n in readings if n != "overflow" or self.engine == "jax"))
-        check_left_out(model, self.engine)
+        left_out.check_left_out(model, self.engine)
         if not isinstance(substeps, int | np.integer) or substeps < 1:
             raise ValueError(f"substeps is {substeps!r}: a control step needs 1, 2, 3 or more.")
-        self.model, self.substeps, self._built = model, substeps, numbers(model, CHANGEABLE_FIELDS)
+        self.model, self.substeps = model, substeps
+        self._built = fields.numbers(model, fields.CHANGEABLE_FIELDS)
         late = (model.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC).any()
         self.reads_forces = bool({*_ACCELERATION, *["sensordata"] * bool(late)} & {*readings})
-        self._follows = functools.cache(functools.partial(consequences, copy.copy(model)))
+        self._follows = functools.cache(functools.partial(fields.consequences, copy.copy(model)))
         self.control_timestep = substeps * float(model.opt.timestep)
         record: Any = collections.namedtuple("Readings", readings)  # type: ignore[misc]
         self._engine = _build_engine(self.engine, model, record, substeps)
@@ -154,14 +146,14 @@ class Physics:
           act: activations [na], as of muscles, that the state begins with; None: zeros.
         """
         model, changes = self.model, self.check_changes(changes)
-        check_shape("qpos", qpos, (model.nq,))
-        check_shape("qvel", qvel, (model.nv,))
+        fields.check_shape("qpos", qpos, (model.nq,))
+        fields.check_shape("qvel", qvel, (model.nv,))
         act = _float32(np.zeros(model.na) if act is None else act)
-        check_shape("act", act, (model.na,))
+        fields.check_shape("act", act, (model.na,))
         if ctrl is not None:
-            check_shape("ctrl", ctrl, (model.nu,))
+            fields.check_shape("ctrl", ctrl, (model.nu,))
             ctrl = _float32(ctrl)
-        qpos = refuse_zero_rotations(model, qpos, changes)
+        qpos = fields.refuse_zero_rotations(model, qpos, changes)
         mocap = np.argsort(model.body_mocapid, kind="stable")[model.nbody - model.nmocap :]
         state = PhysicsState(
             qpos=_float32(qpos),
@@ -178,7 +170,7 @@ class Physics:
         self, state: PhysicsState, ctrl: Array, changes: dict[str, Array] | None = None
     ) -> tuple[PhysicsState, PyTree]:
         """Advances one control step (`substeps` physics steps) under ctrl [nu]."""
-        check_shape("ctrl", ctrl, (self.model.nu,))
+        fields.check_shape("ctrl", ctrl, (self.model.nu,))
         return self._engine.step(state, _float32(ctrl), self.check_changes(changes))
 
     def derive(self, changes: dict[str, Array]) -> dict[str, Array]:
@@ -194,19 +186,17 @@ class Physics:
         Raises:
           ValueError: an unknown field, another shape, or a change that cannot act or be followed.
         """
-        from purerl.physics.constants import derive  # mujoco.batch is slow to import
-
-        check_fields(self.model, self.engine, changes)
+        fields.check_fields(self.model, self.engine, changes)
         behind = {constant for name in changes for constant in self._follows(name)}
-        wanted = tuple(sorted(behind & set(CONSTANTS) - set(changes)))
-        more = derive(self.model, changes, wanted) if wanted else {}
+        wanted = tuple(sorted(behind & set(fields.CONSTANTS) - set(changes)))
+        more = fields.derive(self.model, changes, wanted) if wanted else {}
         return self.check_changes({**changes, **more})
 
     def check_changes(self, changes: dict[str, Array] | None) -> dict[str, Array]:
         """Returns changes in float32; ValueError for those that cannot act, or are half."""
-        check_unedited(self.model, self._built)
-        check_fields(self.model, self.engine, changes or {})
-        return check_whole(self.model, changes or {}, self._follows)
+        fields.check_unedited(self.model, self._built)
+        fields.check_fields(self.model, self.engine, changes or {})
+        return fields.check_whole(self.model, changes or {}, self._follows)
 
 
 def choose_engine(engine: str) -> str:

@@ -37,27 +37,25 @@ def check_left_out(model: mujoco.MjModel, engine: str) -> None:
 def _combinations(model: mujoco.MjModel) -> dict[str, dict[str, bool]]:
     """Returns what each engine leaves out that is in no field alone, and whether it is there."""
     opt, bit = model.opt, mujoco.mjtDisableBit
-    euler, rk4, discrete = (
-        opt.integrator == getattr(mujoco.mjtIntegrator, f"mjINT_{x}")
-        for x in ("EULER", "RK4", "DISCRETE")
-    )
+    integrator = mujoco.mjtIntegrator(opt.integrator).name.removeprefix("mjINT_")
     bits = (bit.mjDSBL_SPRING, bit.mjDSBL_DAMPER, bit.mjDSBL_EULERDAMP)
     springs, dampers, explicit = (bool(opt.disableflags & int(one)) for one in bits)
     rays = model.sensor_type == mujoco.mjtSensor.mjSENS_RANGEFINDER
     plain = (model.sensor_objtype == mujoco.mjtObj.mjOBJ_SITE) & (model.sensor_intprm[:, 0] == 1)
     unseen = np.isin(model.geom_type, [int(x) for x in _UNSEEN])
-    damped = model.dof_damping.any()
+    damped = model.dof_damping.any() and integrator == "EULER"
     late = model.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC
     either = {"a rangefinder on a camera, or with other data than dist": (rays & ~plain).any()}
     jax = {
         "a rangefinder, and a cylinder or height field": rays.any() and unseen.any(),
         "a tactile sensor": (model.sensor_type == mujoco.mjtSensor.mjSENS_TACTILE).any(),
-        "the integrator discrete": discrete,
+        "the integrator discrete": integrator == "DISCRETE",
         "only one of springs and dampers disabled": springs != dampers,
-        "dampers disabled, and eulerdamp not": damped and dampers and euler and not explicit,
+        "dampers disabled, and eulerdamp not": damped and dampers and not explicit,
     }
     warp = {
-        "sensors of accelerations under RK4, at its first stage": rk4 and late.any(),
+        "sensors of accelerations under RK4, at its first stage": integrator == "RK4"
+        and late.any(),
         'gaintype="user"': (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_USER).any(),
     }
     return {"c": {}, "jax": either | jax, "warp": either | warp}

@@ -26,6 +26,13 @@ def hash_model(model: mujoco.MjModel, rest: tuple = ()) -> str:
     return hashlib.sha256(content.tobytes() + repr(rest).encode()).hexdigest()
 
 
+def reading_shapes(model: mujoco.MjModel, names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
+    """Returns each reading's shape: of rotation matrices [n, 3, 3], of "overflow" []."""
+    data = mujoco.MjData(model)
+    shapes = {name: np.shape(getattr(data, name, 0.0)) for name in names}
+    return {n: (s[0], 3, 3) if n.endswith("mat") else s for n, s in shapes.items()}
+
+
 def names(model: mujoco.MjModel, kind: str) -> list[str]:
     """Returns the names of all objects of a kind ("body", "joint", "sensor", ...), by id.
 

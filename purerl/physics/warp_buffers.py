@@ -156,16 +156,12 @@ def filled(shapes: Shapes) -> Shapes:
 
 
 def make_call(
-    name: str,
-    stages: tuple[Stage, ...],
-    takes: Shapes,
-    size: int,
-    get_batch: Callable[[Any], Batch],
+    name: str, stages: tuple[Stage, ...], takes: Shapes, size: int, batch_on: Callable[[Any], Batch]
 ) -> Callable[[dict[str, Array]], list[dict[str, Array]]]:
     """Returns a function for JAX that runs stages on a batch of `size` simulations.
 
     It takes a dict of fields [size, ...] (of the data, or of the model if they are `changed`) and
-    returns what each stage gives. A batch records the graphs of a `name` once. `get_batch` returns
+    returns what each stage gives. A batch records the graphs of a `name` once. `batch_on` returns
     the batch on Warp's current device; Warp keeps it as long as the process lasts.
     """
     inputs = list(filled(takes))
@@ -182,7 +178,7 @@ def make_call(
         return lambda _: [{f: empty(s) for f, s in stage.gives.items()} for stage in stages]
 
     def run(*arrays: wp.array) -> None:
-        get_batch(wp.get_device()).call(name, stages, inputs, arrays)
+        batch_on(wp.get_device()).call(name, stages, inputs, arrays)
 
     dtypes: dict[str, Any] = {f"in_{field}": wp.float32 for field in inputs}
     dtypes |= {f"{f}_{i}": wp.int32 if f == "overflow" else wp.float32 for i, f in lengths}

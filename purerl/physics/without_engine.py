@@ -5,23 +5,19 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
-import numpy as np
 
 from purerl.core.env import Env
 from purerl.core.records import Array, PyTree
-from purerl.physics.interface import Physics
+from purerl.physics import interface, lookup
 
 
 class NoEngine:
     """In the place of an engine: results of the right shapes, which follow from all it is given."""
 
-    def __init__(self, physics: Physics) -> None:
-        """Asks MuJoCo for the readings' shapes; engine `warp` has one more, "overflow" []."""
-        data, self.record = mujoco.MjData(physics.model), physics._engine.record
-        shapes = {name: np.shape(getattr(data, name, 0.0)) for name in self.record._fields}
-        # As on all engines, matrices are [n, 3, 3].
-        self.shapes = [(s[0], 3, 3) if name.endswith("mat") else s for name, s in shapes.items()]
+    def __init__(self, physics: interface.Physics) -> None:
+        """Asks MuJoCo for the readings' shapes."""
+        self.record = physics._engine.record
+        self.shapes = lookup.reading_shapes(physics.model, self.record._fields).values()
 
     def init(self, state: PyTree, changes: dict[str, Array], ctrl: Array | None = None) -> tuple:
         """Returns readings."""
@@ -41,7 +37,7 @@ def without_engine(env: Env) -> Env:
     environment holds under another name, or as a property, computes as ever.
     """
     held: Any = getattr(env, "__dict__", {})
-    if not isinstance(held.get("physics"), Physics):
+    if not isinstance(held.get("physics"), interface.Physics):
         return env
     found: Any = copy.copy(env)
     found.__dict__["physics"] = still = copy.copy(held["physics"])

@@ -20,11 +20,9 @@ from purerl.core.env import Env
 from purerl.core.keys import Purpose, derive, per_environment
 from purerl.core.parts import WHOLE, Parts, add_in_order, as_one_part
 from purerl.core.records import Array, Metrics, Network, PyTree, TrainState, add_count, zero_count
-from purerl.ppo import episodes, running_moments
-from purerl.ppo.batches import make_batch
+from purerl.ppo import batches, episodes, optimizer, running_moments
 from purerl.ppo.config import Config
 from purerl.ppo.learner import learn
-from purerl.ppo.optimizer import optimizer
 from purerl.ppo.rollout import Transition, rollout
 from purerl.ppo.running_moments import Moments, deviations, merge, pool
 
@@ -69,7 +67,7 @@ def init(config: Config, env: Env, network: Network, key: Array) -> TrainState:
     limit = jax.vmap(lambda k, most: jax.random.randint(k, (), 1, most + 1))(limit_keys, longest)
     return TrainState(
         params=params,
-        optimizer=optimizer(config).init(params),
+        optimizer=optimizer.optimizer(config).init(params),
         learning_rate=jnp.asarray(config.learning_rate, jnp.float32),
         normalizer=running_moments.init(jax.tree.map(lambda x: x[0], env_state.observation)),
         reward_normalizer=running_moments.init(jnp.zeros(())),
@@ -174,7 +172,7 @@ def improve(
     # for long. A point with a bonus of 1 for being alive (tests/ppo/test_probes.py) had lost 100
     # after ten updates, on four seeds, where it gains 43 of 50 now.
     state = state.replace(reward_normalizer=merge(state.reward_normalizer, pool(returns)))
-    batch = parts.map(functools.partial(make_batch, config, state), experience.transitions)
+    batch = parts.map(functools.partial(batches.make_batch, config, state), experience.transitions)
     part_ids = experience.env_ids[:, 0]  # no environment is in two parts, so its id names the part
     state, learning = learn(config, network, state, batch, experience.memory, part_ids, parts)
     # Those of observations move last. While they stood still, the learner normalized as the policy

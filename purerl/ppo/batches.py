@@ -7,10 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from purerl.core.records import Array, Normal, PyTree, TrainState
-from purerl.ppo import running_moments
-from purerl.ppo.advantages import gae
+from purerl.ppo import advantages, rollout, running_moments
 from purerl.ppo.config import Config
-from purerl.ppo.rollout import Transition
 
 
 class Batch(NamedTuple):
@@ -41,7 +39,7 @@ def reward_factor(config: Config, state: TrainState) -> Array:
     return config.reward_scale * jax.lax.rsqrt(variance + running_moments.VARIANCE_FLOOR)
 
 
-def make_batch(config: Config, state: TrainState, transitions: Transition) -> Batch:
+def make_batch(config: Config, state: TrainState, transitions: rollout.Transition) -> Batch:
     """Computes advantages and value targets of a rollout.
 
     Args:
@@ -53,7 +51,7 @@ def make_batch(config: Config, state: TrainState, transitions: Transition) -> Ba
     Returns:
       The batch, [T, B, ...].
     """
-    of_one = functools.partial(gae, gamma=config.gamma, lambda_=config.gae_lambda)
+    of_one = functools.partial(advantages.gae, gamma=config.gamma, lambda_=config.gae_lambda)
     # Computed once. Through all epochs the advantages and the targets are those of the policy that
     # acted, so no gradient passes through them.
     advantage = jax.vmap(of_one, in_axes=1, out_axes=1)(

@@ -8,15 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from purerl.core.env import ABSURD, Env, State
-from purerl.core.records import (
-    Array,
-    EpisodeStats,
-    Metrics,
-    Network,
-    PolicyOutput,
-    PyTree,
-    TrainState,
-)
+from purerl.core.records import Array, EpisodeStats, Network, PolicyOutput, PyTree, TrainState
 from purerl.ppo import running_moments
 from purerl.ppo.config import Config
 
@@ -114,14 +106,14 @@ def is_lost(state: State) -> Array:
     return ~jnp.all(jnp.stack(sound))
 
 
-def episode_metrics(episode: EpisodeStats) -> Metrics:
+def episode_metrics(episode: EpisodeStats) -> dict[str, Array]:
     """Returns episodes' metrics [B]: the mean over their steps, or the sum for `*_count`."""
     # At least 1, because an episode that has just begun has no step.
     length = jnp.maximum(episode.length, 1).astype(jnp.float32)
     return {k: x if k.endswith("_count") else x / length for k, x in episode.metrics.items()}
 
 
-def episode_sums(episode: EpisodeStats, done: Array, lost: Array) -> Metrics:
+def episode_sums(episode: EpisodeStats, done: Array, lost: Array) -> dict[str, Array]:
     """Returns what each environment adds to the sums of a rollout in one step, name -> [B].
 
     Args:

@@ -12,8 +12,7 @@ import tyro
 
 from purerl.core.errors import UserError
 from purerl.experiment.command_line import main_of
-from purerl.machine.command_errors import leave
-from purerl.machine.output import show
+from purerl.machine import command_errors, output
 
 
 @dataclass(frozen=True)
@@ -41,11 +40,11 @@ def command(options: ReportOptions) -> None:
     page = make_page(runs, options.group_by).encode()
     write_answer(options.out, page)
     number = f"{len(runs)} run{'s' * (len(runs) > 1)}"
-    show(f"{options.out} ({number}, {len(page):,} bytes): open it in a browser")
+    output.show(f"{options.out} ({number}, {len(page):,} bytes): open it in a browser")
 
 
 main = main_of(ReportOptions, command, "python -m purerl.report")
 
 
 if __name__ == "__main__":
-    leave(main)
+    command_errors.leave(main)

@@ -53,8 +53,7 @@ def probability_of_improvement(x: Values, y: Values) -> Values:
 
     P(X > Y) + P(X = Y) / 2 over all n m pairs, that is, the Mann-Whitney U statistic over n m.
     """
-    pairs = x[..., :, None] - y[..., None, :]
-    return (np.sign(pairs) / 2 + 0.5).mean(axis=(-2, -1))
+    return (np.sign(x[..., :, None] - y[..., None, :]) / 2 + 0.5).mean(axis=(-2, -1))
 
 
 def stratified_probability(xs: Sequence[Values], ys: Sequence[Values]) -> Values:

@@ -48,8 +48,7 @@ def compare(
     Raises:
       UserError: a place means no run, or there is no such metric or setting.
     """
-    runs = run_reader.read_runs(places, "compare")
-    result, curves = compare_records(runs, metric, group_by)
+    result, curves = compare_records(run_reader.read_runs(places, "compare"), metric, group_by)
     if result["unscored"] and not result["pairs"]:  # else the bits can be compared all the same
         raise UserError(result["unscored"])
     return result, curves
@@ -102,15 +101,13 @@ def describe(result: dict[str, Any]) -> list[str]:
     if result["unscored"]:
         return [*lines, f"No scores: {result['unscored']}"]
     groups, versus = result["groups"], result["versus_first"]
-    short = short_names([g["label"] for g in groups])
-    lines += [f"group {name} is {label}" for label, name in short.items() if name != label]
-    named = [
-        g | {"worst_run": Path(g["worst_run"]).name, "label": short[g["label"]]} for g in groups
-    ]
-    lines += table(GROUPS, named)
+    said = short_names([g["label"] for g in groups])
+    lines += [f"group {name} is {label}" for label, name in said.items() if name != label]
+    rows = [g | {"worst_run": Path(g["worst_run"]).name, "label": said[g["label"]]} for g in groups]
+    lines += table(GROUPS, rows)
     if versus:
-        lines += ["", f"against {short[versus[0]['baseline']]}:"]
-        lines += table(VERSUS, [v | {"label": short[v["label"]]} for v in versus])
+        lines += ["", f"against {said[versus[0]['baseline']]}:"]
+        lines += table(VERSUS, [v | {"label": said[v["label"]]} for v in versus])
         if any(v["same_seeds"] for v in versus):
             lines.append(
                 "Paired: differences between runs of one seed, which begin with the same weights "

@@ -5,15 +5,12 @@ from typing import Any
 
 import flax.linen as nn
 import jax
-import numpy as np
 
 from purerl.core.keys import Purpose, derive
 from purerl.core.records import Array, TrainState
 from purerl.experiment.objects import Setup
 from purerl.machine.state_arrays import Leaves, flatten
-from purerl.ppo import distributions
-from purerl.ppo.episodes import act
-from purerl.ppo.evaluation import Progress, advance, start
+from purerl.ppo import distributions, episodes, evaluation
 
 
 def note_modules(noted: dict[str, Array]) -> Callable[..., Any]:
@@ -36,7 +33,7 @@ def note_modules(noted: dict[str, Array]) -> Callable[..., Any]:
 
 def play(
     setup: Setup, state: TrainState, reset_key: Array, number: int, steps: int
-) -> tuple[Progress, dict[str, Any]]:
+) -> tuple[evaluation.Progress, dict[str, Any]]:
     """Plays N whole episodes by the deterministic policy; pure.
 
     Args:
@@ -53,12 +50,12 @@ def play(
     """
     config, env, network, _ = setup
 
-    def step(now: Progress, _: None) -> tuple[Progress, dict[str, Any]]:
+    def step(now: evaluation.Progress, _: None) -> tuple[evaluation.Progress, dict[str, Any]]:
         noted: dict[str, Array] = {}
         with nn.intercept_methods(note_modules(noted)):
-            output, memory = act(network, state, now.env_state, now.memory)
+            output, memory = episodes.act(network, state, now.env_state, now.memory)
         action = distributions.to_action(output.distribution.loc)
-        following = advance(env, now, action, memory)
+        following = evaluation.advance(env, now, action, memory)
         return following, {
             "running": ~(now.over | following.lost),
             "state": now.env_state,
@@ -70,7 +67,7 @@ def play(
             "network": noted,
         }
 
-    begun = start(env, state, reset_key, number, config.episode_length)
+    begun = evaluation.start(env, state, reset_key, number, config.episode_length)
     return jax.lax.scan(step, begun, length=steps)
 
 
@@ -91,6 +88,6 @@ def record(setup: Setup, state: TrainState, seed: int, number: int) -> Leaves:
     rows |= {name: getattr(now, name) for name in ("observation", "physics", "metrics", "task")}
     # Names of modules and metrics may have slashes of their own, which stay as they are.
     leaves = {name.replace("~1", "/"): x for name, x in flatten(rows).items() if x.size}
-    arrays = {name: np.swapaxes(x, 0, 1) for name, x in leaves.items()}
+    arrays = {name: x.swapaxes(0, 1) for name, x in leaves.items()}
     length = arrays.pop("running").sum(axis=1)
     return {"length": length} | {name: x[:, : length.max()] for name, x in arrays.items()}

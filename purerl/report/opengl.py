@@ -53,7 +53,6 @@ def open_gl(width: int, height: int) -> Any:
         context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
         context.make_current()
     except Exception as error:  # each backend has its own kinds, some without a printable message
-        raise RunError(
-            f"OpenGL does not start by {backend} ({type(error).__name__}). {INSTALL}"
-        ) from error
+        kind = type(error).__name__
+        raise RunError(f"OpenGL does not start by {backend} ({kind}). {INSTALL}") from error
     return context

@@ -12,18 +12,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from purerl.report import comparison, page_series, page_tables
+from purerl.report import comparison, page_media, page_series, page_tables, run_reader
 from purerl.report.html_elements import Html, element, join
 from purerl.report.page_charts import SMALL, WIDE, chart, look, short
-from purerl.report.page_media import LARGEST_PAGE, media_elements, read_media
-from purerl.report.run_reader import RunRecord
 from purerl.report.seed_statistics import Group, make_groups
 
 HERE = Path(__file__).parent
 FOLDERS = re.compile(r"""(data:[^"]*)|(?<![\w./:<])/(?:[^/<>"\s]+/)+""")  # not in pictures
 
 
-def make_page(runs: Sequence[RunRecord], group_by: Sequence[str] = ()) -> str:
+def make_page(runs: Sequence[run_reader.RunRecord], group_by: Sequence[str] = ()) -> str:
     """Returns the whole page as HTML; the same runs give the same page.
 
     Args:
@@ -139,7 +137,7 @@ def _charts(sections: Sequence[tuple[str, list[page_series.Panel]]], several: bo
     return parts
 
 
-def _unseen(runs: Sequence[RunRecord]) -> list[Html]:
+def _unseen(runs: Sequence[run_reader.RunRecord]) -> list[Html]:
     """Returns a line about metrics that have no chart; empty where all have."""
     more = len(page_series.metric_names(runs)) - page_series.MOST_PANELS
     said = f"{more:,} more metrics have no chart: a page takes {page_series.MOST_PANELS}."
@@ -183,9 +181,9 @@ def _series_data(
 
 
 def _media(folders: Sequence[Path]) -> list[Html]:
-    room, parts = LARGEST_PAGE, list[Html]()
+    room, parts = page_media.LARGEST_PAGE, list[Html]()
     for folder in folders:
-        media = read_media(folder, room)
+        media = page_media.read_media(folder, room)
         room = media.room
-        parts += media_elements(folder.name, media)
+        parts += page_media.media_elements(folder.name, media)
     return [element("div", join(parts), class_="pictures")] if parts else []

@@ -3,9 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from purerl.report.bootstrap import center_name
-from purerl.report.run_reader import RunRecord
-from purerl.report.seed_statistics import Group, learning_curve
+from purerl.report import bootstrap, run_reader, seed_statistics
 
 MOST_POINTS = 400  # of a line; a chart is some 500 pixels wide
 MOST_PANELS = 300  # a page with more is slow to open
@@ -44,13 +42,13 @@ class Panel(NamedTuple):
     series: list[Series]
 
 
-def metric_names(runs: Iterable[RunRecord]) -> list[str]:
+def metric_names(runs: Iterable[run_reader.RunRecord]) -> list[str]:
     """Returns the metrics that have curves, in the order in which the files name them."""
     names = dict.fromkeys(name for run in runs for line in run.lines for name in line)
     return [name for name in names if name not in NOT_CURVES]
 
 
-def panels(groups: Sequence[Group]) -> list[tuple[str, list[Panel]]]:
+def panels(groups: Sequence[seed_statistics.Group]) -> list[tuple[str, list[Panel]]]:
     """Returns the charts by section, sections without any left out."""
     names = metric_names(run for group in groups for run in group.runs)
     found: dict[str, list[Panel]] = {title: [] for title, _ in SECTIONS}
@@ -70,7 +68,7 @@ def section_of(metric: str) -> str:
     return next(title for title, starts in others if metric.startswith(starts))
 
 
-def series_of(groups: Sequence[Group], metric: str) -> list[Series]:
+def series_of(groups: Sequence[seed_statistics.Group], metric: str) -> list[Series]:
     """Returns a line for each run, and for each group of several the interquartile mean."""
     number = sum(len(group.runs) for group in groups)
     found = []
@@ -89,7 +87,7 @@ def visible(curve: dict[int, float]) -> dict[int, float]:
     return {s: v if abs(v) > 1 / HUGE else 0.0 for s, v in curve.items() if abs(v) < HUGE}
 
 
-def _run_series(run: RunRecord, metric: str, g: int, r: int, spread: bool) -> Series:
+def _run_series(run: run_reader.RunRecord, metric: str, g: int, r: int, spread: bool) -> Series:
     curve = visible(run.curve(metric))
     steps, values, low, high = thin(list(curve), list(curve.values()))
     if metric == RETURN and len(steps) == len(curve):
@@ -100,12 +98,12 @@ def _run_series(run: RunRecord, metric: str, g: int, r: int, spread: bool) -> Se
     return Series(run.path.name, g, r, steps, values, *band)
 
 
-def _group_series(group: Group, metric: str, g: int) -> list[Series]:
-    curve = learning_curve(group, metric)
+def _group_series(group: seed_statistics.Group, metric: str, g: int) -> list[Series]:
+    curve = seed_statistics.learning_curve(group, metric)
     if curve is None or len(curve.runs) < 2 or any(visible(run) != run for run in curve.runs):
         return []
     iqm, low, high = (None if a is None else [float(v) for v in a] for a in curve.band)
-    label = f"{center_name(len(curve.runs))} of {len(curve.runs)}"
+    label = f"{bootstrap.center_name(len(curve.runs))} of {len(curve.runs)}"
     return [Series(label, g, None, curve.steps, iqm or [], low, high)]
 
 

@@ -11,10 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from purerl.core.records import Array, PyTree
-from purerl.ppo import distributions, running_moments
-from purerl.ppo.episodes import start_memory
-from purerl.report.episode_arrays import record
-from purerl.report.flat_program import flat_program
+from purerl.ppo import distributions, episodes, running_moments
+from purerl.report import episode_arrays, flat_program
 from purerl.runs.loaded_run import Run
 
 EPISODES = 8  # that an exported policy is compared on
@@ -52,7 +50,7 @@ class Recorded(NamedTuple):
 
 def record_episodes(run: Run, seed: int) -> Recorded:
     """Plays whole episodes of a run's policy."""
-    arrays = record(run.restored.setup, run.state, seed, EPISODES)
+    arrays = episode_arrays.record(run.restored.setup, run.state, seed, EPISODES)
     prefix = "observation/"
     parts = {k.removeprefix(prefix): x for k, x in arrays.items() if k.startswith(prefix)}
     return Recorded(parts or arrays["observation"], arrays["action"], arrays["length"])
@@ -95,7 +93,7 @@ def policy_function(run: Run) -> PolicyFunction:
     network, state = run.network, run.state
     shapes = jax.eval_shape(run.env.reset, jax.random.key(0)).observation
     everything = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    memory = jax.tree.map(lambda x: x[0], start_memory(state.memory, 1))
+    memory = jax.tree.map(lambda x: x[0], episodes.start_memory(state.memory, 1))
 
     def act(observation: PyTree, memory: PyTree) -> tuple[Array, PyTree]:
         seen = running_moments.normalize(state.normalizer, observation)
@@ -104,7 +102,7 @@ def policy_function(run: Run) -> PolicyFunction:
 
     if not isinstance(everything, dict):
         return PolicyFunction(act, everything, memory)
-    read = flat_program(act, everything, memory).read
+    read = flat_program.flat_program(act, everything, memory).read
     names = [name for number, name in enumerate(sorted(everything)) if number in read]
     needed = {name: everything[name] for name in names}
 

@@ -20,8 +20,7 @@ def write_npz(run: Run, file: Path) -> Callable[[Any], np.ndarray]:
     Raises:
       UserError: the network is none of `networks.mlp` and `networks.recurrent`.
     """
-    arrays = policy_arrays(run)
-    write_arrays(file, arrays)
+    write_arrays(file, policy_arrays(run))
     policy = Policy(file)
     return lambda observation: policy(networks.policy_features(observation))
 

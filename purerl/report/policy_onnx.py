@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import onnx
 import onnxruntime
@@ -13,9 +12,7 @@ from onnx import helper
 
 from purerl.core.records import Array, PyTree
 from purerl.machine.files import write_answer
-from purerl.report import policy_file
-from purerl.report.flat_program import batched, flat_program
-from purerl.report.onnx_nodes import OPSET, Nodes
+from purerl.report import flat_program, onnx_nodes, policy_file
 from purerl.runs.loaded_run import Run
 
 KINDS = {"tensor(uint8)": np.uint8}  # of inputs other than float32
@@ -57,20 +54,20 @@ def build_model(
         action, memory = policy.act(observation, memory)
         if limits is None:
             return action, [], memory
-        low, high = jnp.asarray(limits).T
+        low, high = limits.T
         return action, [low + 0.5 * (action + 1.0) * (high - low)], memory
 
     arguments = (policy.observation, policy.memory)
-    program = flat_program(outputs, *arguments)
+    program = flat_program.flat_program(outputs, *arguments)
     given = names("observation", policy.observation) + names("memory", policy.memory)
     taken = ["action", "control"][: 1 + (limits is not None)] + names("next_memory", policy.memory)
-    made = jax.tree.leaves(jax.eval_shape(outputs, *batched(arguments)))
-    nodes = Nodes(given)
+    made = jax.tree.leaves(jax.eval_shape(outputs, *flat_program.batched(arguments)))
+    nodes = onnx_nodes.Nodes(given)
     nodes.write(program, taken)
     read = [_info(n, x.shape, x) for n, x in zip(given, jax.tree.leaves(arguments), strict=True)]
     results = [_info(name, x.shape[1:], x) for name, x in zip(taken, made, strict=True)]
     graph = helper.make_graph(nodes.nodes, "policy", read, results, nodes.constants)
-    opset = [helper.make_opsetid("", OPSET)]
+    opset = [helper.make_opsetid("", onnx_nodes.OPSET)]
     model = helper.make_model(graph, opset_imports=opset, ir_version=IR_VERSION)
     helper.set_model_props(model, {name: str(value) for name, value in notes.items()})
     return model

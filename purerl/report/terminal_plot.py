@@ -4,9 +4,8 @@ from collections.abc import Iterable, Sequence
 from itertools import cycle
 
 from purerl.core.errors import UserError, unknown_name
-from purerl.report.page_charts import extent, short
+from purerl.report import page_charts, run_reader
 from purerl.report.page_series import metric_names, visible
-from purerl.report.run_reader import RunRecord
 from purerl.report.seed_statistics import Curve
 
 MARKS = "*ox+#@%&"
@@ -14,7 +13,7 @@ LEAST_COLUMNS, LEAST_ROWS = 20, 6  # of the field
 LABEL = 10  # columns left of the field
 
 
-def check_plotted(runs: Sequence[RunRecord], metric: str) -> None:
+def check_plotted(runs: Sequence[run_reader.RunRecord], metric: str) -> None:
     """Raises UserError unless a run has a value of the metric that can be drawn."""
     if not any(visible(run.curve(metric)) for run in runs):
         names = metric_names(runs)
@@ -35,7 +34,7 @@ def draw(curves: Sequence[Curve], metric: str, columns: int, rows: int) -> list[
     columns, rows = max(columns - LABEL - 1, LEAST_COLUMNS), max(rows, LEAST_ROWS)
     points = [[(s, v) for run in curve.runs for s, v in visible(run).items()] for curve in curves]
     every = [point for each in points for point in each]
-    low, high = extent([value for _, value in every])
+    low, high = page_charts.extent([value for _, value in every])
     last = max(steps for steps, _ in every) or 1
     field = [[" "] * columns for _ in range(rows)]
     for curve, mark in zip(curves, cycle(MARKS), strict=False):
@@ -45,10 +44,10 @@ def draw(curves: Sequence[Curve], metric: str, columns: int, rows: int) -> list[
     every_fourth = {0, rows - 1} | set(range(0, rows, max(rows // 4, 1)))
     lines = [metric]
     for i, row in enumerate(field):
-        label = short(high - (high - low) * i / (rows - 1)) if i in every_fourth else ""
+        label = page_charts.short(high - (high - low) * i / (rows - 1)) if i in every_fourth else ""
         lines.append(f"{label[:LABEL]:>{LABEL}}|{''.join(row)}".rstrip())
     lines.append(f"{'':{LABEL}}+{'-' * columns}")
-    end = f"{short(last)} steps"
+    end = f"{page_charts.short(last)} steps"
     lines.append(f"{'':{LABEL}} 0{end:>{columns - 1}}")
     legend = zip(curves, cycle(MARKS), strict=False)
     return lines + [f"  {mark}  {c.label} ({_count(c.runs)})" for c, mark in legend]

@@ -1,7 +1,6 @@
 """Videos for TensorBoard and Weights & Biases, which show what `run --video` made."""
 
 import io
-import itertools
 from pathlib import Path
 
 from PIL import Image
@@ -65,13 +64,11 @@ def as_gif(video: Path) -> tuple[bytes, tuple[int, int]]:
     width, height = about["size"]
     size = GIF_WIDTH, round(GIF_WIDTH * height / width)
     stride = max(1, round(about["fps"] / GIF_RATE))
-    kept = itertools.islice(reader, 0, None, stride)
+    kept = (frame for i, frame in enumerate(reader) if i % stride == 0)
     frames = [Image.frombytes("RGB", (width, height), frame).resize(size) for frame in kept]
     content = io.BytesIO()
-    milliseconds = round(1000 * stride / about["fps"])
-    frames[0].save(
-        content, "GIF", save_all=True, append_images=frames[1:], duration=milliseconds, loop=0
-    )
+    ms = round(1000 * stride / about["fps"])
+    frames[0].save(content, "GIF", save_all=True, append_images=frames[1:], duration=ms, loop=0)
     return content.getvalue(), size
 
 

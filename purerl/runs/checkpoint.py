@@ -14,16 +14,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from purerl.core.errors import UserError, one_line
 from purerl.core.records import PyTree
-from purerl.machine import array_files
-from purerl.machine.files import hash_files, sync, sync_tree
+from purerl.machine import array_files, files
 from purerl.machine.state_arrays import Leaves, digest_leaves, leaf_paths, raw, unflatten
-from purerl.runs import checkpoint_folder
-from purerl.runs.identity import Owner, check_owner
+from purerl.runs import checkpoint_folder, manifest
 
 
 class Saved(NamedTuple):
@@ -54,20 +51,20 @@ def save(folder: Path, leaves: Leaves, meta: dict[str, Any]) -> Path:
         meta = meta | {"leaves": {key: _describe(array) for key, array in leaves.items()}}
         # Where a folder could not be listed for a moment, Orbax left arrays out, and said nothing.
         _compare(array_files.read(draft / "state", stored), meta["leaves"])
-        meta["files"] = hash_files(draft)
+        meta["files"] = files.hash_files(draft)
         meta["meta_sha256"] = checkpoint_folder.hash_meta(meta)
         (draft / checkpoint_folder.META).write_text(json.dumps(meta))
-        sync_tree(draft)
+        files.sync_tree(draft)
         checkpoint_folder.discard(path)
         draft.rename(path)
-        sync(folder)
+        files.sync(folder)
     except BaseException:
         checkpoint_folder.clean(folder)
         raise
     return path
 
 
-def load_checkpoint(path: Path, abstract: PyTree, owners: Sequence[Owner] = ()) -> Saved:
+def load_checkpoint(path: Path, abstract: PyTree, owners: Sequence[manifest.Owner] = ()) -> Saved:
     """Reads one checkpoint and checks every hash.
 
     Args:
@@ -81,10 +78,10 @@ def load_checkpoint(path: Path, abstract: PyTree, owners: Sequence[Owner] = ()) 
         `abstract` (other sizes or networks).
     """
     meta = checkpoint_folder.load_meta(path)
-    check_owner(path, meta, owners)
+    manifest.check_owner(path, meta, owners)
     wanted = _check_fits(path, meta, abstract)
     checkpoint_folder.check_files(path, meta)
-    leaves = {key: np.zeros(shape, jnp.dtype(dtype)) for key, (dtype, shape) in wanted.items()}
+    leaves = {key: np.zeros(shape, np.dtype(dtype)) for key, (dtype, shape) in wanted.items()}
     try:
         leaves |= array_files.read(path / "state", {k: x for k, x in leaves.items() if x.size})
         _compare(leaves, meta["leaves"])
@@ -106,7 +103,7 @@ def newest(
     abstract: PyTree,
     say: Callable[[str], None],
     rename: bool = True,
-    owners: Sequence[Sequence[Owner]] = (),
+    owners: Sequence[Sequence[manifest.Owner]] = (),
 ) -> list[Saved]:
     """Reads the newest update that all folders hold whole.
 

@@ -9,15 +9,14 @@ import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from purerl.core.errors import UserError
-from purerl.machine import files
-from purerl.machine.lock import LOCK
+from purerl.core.errors import UserError, reason
+from purerl.machine import files, lock
 from purerl.runs import checkpoint_folder
-from purerl.runs.identity import fingerprint
+from purerl.runs.manifest import fingerprint
 
 CONFIG, MANIFEST, CODE = "config.json", "manifest.json", "experiment.py"
 METRICS, CHECKPOINTS = "metrics.jsonl", "checkpoints"
-OURS = {LOCK, CONFIG, MANIFEST, CODE, METRICS, CHECKPOINTS}
+OURS = {lock.LOCK, CONFIG, MANIFEST, CODE, METRICS, CHECKPOINTS}
 
 
 class Folder(NamedTuple):
@@ -90,7 +89,7 @@ def _list(path: Path) -> Folder:
         names = frozenset(entry.name for entry in entries)
         return Folder(path, path.exists(), names, frozenset(links), {}, {}, b"", updates, damaged)
     except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read: {files.reason(error)}.") from error
+        raise UserError(f"{path} cannot be read: {reason(error)}.") from error
 
 
 def read_run(path: Path) -> Folder:
@@ -165,4 +164,4 @@ def runs_in(place: Path) -> list[Path]:
         below = (sorted(place.glob(f"{stars}/{CONFIG}")) for stars in ("*", "*/*"))
         return [file.parent for file in next(filter(None, below), [])]
     except (OSError, ValueError) as error:
-        raise UserError(f"{place} cannot be read: {files.reason(error)}.") from error
+        raise UserError(f"{place} cannot be read: {reason(error)}.") from error

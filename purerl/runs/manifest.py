@@ -1,8 +1,11 @@
 """The manifest: all that a run's bits depend on besides its settings.
 
-A run writes it down at the start, and `--resume` compares it.
+A run writes it down at the start, and `--resume` compares it. A hash of it is in every checkpoint,
+with the run's id: they say whose file it is (`Owner`).
 """
 
+import hashlib
+import json
 import os
 import platform
 import re
@@ -10,7 +13,7 @@ import subprocess
 from collections.abc import Callable, Iterable, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from purerl import exact
 from purerl.core.errors import UserError
@@ -21,7 +24,7 @@ PACKAGES = ["jax", "jaxlib", "mujoco", "mujoco-mjx", "dm-control", "flax", "opta
 PACKAGES += ["orbax-checkpoint"]
 INFORMATIVE = {"run_id", "name", "git_revision", "git_dirty", "allowed_changes"}
 INFORMATIVE |= {"devices"}  # how many share the shards
-INFORMATIVE |= {"fingerprint", "had_checkpoint"}  # identity.py, folder.py
+INFORMATIVE |= {"fingerprint", "had_checkpoint"}  # below, folder.py
 # What these follow from is compared itself.
 INFORMATIVE |= {"experiment_file", "bit_exact", "inexact_because"}
 FLAGS = ("XLA_FLAGS", "NCCL_ALGO", "NCCL_NVLS_ENABLE")
@@ -170,3 +173,49 @@ def _git(folder: Path) -> dict[str, Any]:
         said = ""
     revision = said.removesuffix("-dirty")
     return {"git_revision": revision or None, "git_dirty": revision != said if said else None}
+
+
+class Owner(NamedTuple):
+    """A run, or an earlier life of it under other conditions."""
+
+    run_id: str
+    fingerprint: str
+    until: float = float("inf")  # the last update that it trained
+
+
+def fingerprint(config: dict[str, Any], facts: dict[str, Any], source: bytes) -> str:
+    """Returns a sha256 over everything that can change a run's bits.
+
+    Args:
+      config: of config.json.
+      facts: of manifest.json.
+      source: of experiment.py.
+    """
+    relevant = {key: value for key, value in facts.items() if key not in INFORMATIVE}
+    text = json.dumps([config, relevant], sort_keys=True).encode()
+    return hashlib.sha256(text + b"\0" + source).hexdigest()
+
+
+def owners(facts: dict[str, Any]) -> list[Owner]:
+    """Returns whose checkpoints a run may hold: its own, and those from before allowed changes."""
+    run_id, found = facts["run_id"], [Owner(facts["run_id"], facts["fingerprint"])]
+    for change in reversed(facts.get("allowed_changes", [])):
+        run_id = change.get("of", {}).get("run_id", run_id)
+        found.append(Owner(run_id, change["fingerprint"], change["after_update"]))
+    return found
+
+
+def check_owner(path: Path, meta: dict[str, Any], owners: Sequence[Owner]) -> None:
+    """Raises UserError if a checkpoint is of none of `owners` (no owners: of anybody)."""
+    run: dict[str, Any] = meta["run"] if isinstance(meta.get("run"), dict) else {}
+    ids = run.get("run_id"), run.get("fingerprint")
+    same = [owner for owner in owners if (owner.run_id, owner.fingerprint) == ids]
+    if not owners or any(meta["update"] <= owner.until for owner in same):
+        return
+    whose = f"of the run {ids[0]}, seed {run.get('seed')}"
+    if ids[0] == owners[0].run_id:
+        whose = "of this run under other settings or conditions than it has now"
+    raise UserError(
+        f"The checkpoint {path} is {whose}; this run is {owners[0].run_id}. It is not used: move "
+        "it out of the folder."
+    )

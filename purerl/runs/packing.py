@@ -3,7 +3,6 @@
 import glob
 import gzip
 import io
-import itertools
 import json
 import shlex
 import sys
@@ -14,11 +13,9 @@ from pathlib import Path
 
 from purerl.core.errors import UserError, one_line
 from purerl.experiment.source_hashes import IMPORTED, PACKAGE
-from purerl.machine.file_reads import reads_among
-from purerl.machine.output import show
-from purerl.runs import checkpoint_folder
+from purerl.machine import file_reads, output
+from purerl.runs import checkpoint_folder, restored_run
 from purerl.runs.folder import CODE, CONFIG, MANIFEST, check_manifest, read_run, runs_in
-from purerl.runs.restored_run import restore
 
 
 def pack(run: Path, trust: bool) -> dict[Path, bytes]:
@@ -33,8 +30,8 @@ def pack(run: Path, trust: bool) -> dict[Path, bytes]:
     here = Path.cwd()
     # Neither hidden files nor Python's compiled ones.
     seen = [here / name for name in glob.iglob("**", root_dir=here, recursive=True)]
-    with reads_among(file for file in seen if file.is_file()) as read:
-        restored = restore(run.absolute(), "latest", show, trust=trust)
+    with file_reads.reads_among(file for file in seen if file.is_file()) as read:
+        restored = restored_run.restore(run.absolute(), "latest", output.show, trust=trust)
     folder, facts = restored.folder, restored.folder.manifest
     # Of an empty file nothing is read.
     read |= {*seen} & {place / "__init__.py" for file in read for place in file.parents}
@@ -49,10 +46,9 @@ def pack(run: Path, trust: bool) -> dict[Path, bytes]:
     best = [update for _, update in checkpoint_folder.best_by_stage(folder.checkpoints).values()]
     place = Path("runs", restored.source.name, folder.path.name)
     kept = {restored.saved.meta["update"], *best[-1:]}
-    saved = [checkpoint_folder.path_of(folder.checkpoints, update).rglob("*") for update in kept]
-    for file in filter(
-        Path.is_file, itertools.chain([folder.path / CONFIG, folder.metrics], *saved)
-    ):
+    saved = (checkpoint_folder.path_of(folder.checkpoints, update).rglob("*") for update in kept)
+    files = [folder.path / CONFIG, folder.metrics, *(file for some in saved for file in some)]
+    for file in filter(Path.is_file, files):
         packed[place / file.relative_to(folder.path)] = file.read_bytes()
     # Here it stands elsewhere, and whose machine this is concerns nobody.
     manifest = json.dumps(facts | {"experiment_file": str(name)}, indent=2).encode()

@@ -65,9 +65,8 @@ class Policy:
 
         The leading axes are those of the observation.
         """
-        return jax.tree.map(
-            lambda x: np.asarray(x).reshape(*self._batch, *x.shape[1:]), self._memory
-        )
+        batch = self._batch
+        return jax.tree.map(lambda x: np.asarray(x).reshape(*batch, *x.shape[1:]), self._memory)
 
     def __call__(self, observation: PyTree, key: Array | None = None) -> np.ndarray:
         """Chooses an action, and moves the memory on.

@@ -4,20 +4,15 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from purerl.checks.held_arrays import hash_held
-from purerl.checks.user_code import own_line
+from purerl.checks import findings, held_arrays, user_code
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.records import TrainState
-from purerl.devices import memory
-from purerl.devices.programs import abstract_state
-from purerl.experiment import settings_json
-from purerl.experiment.definition import Experiment
-from purerl.experiment.loading import Source
+from purerl.devices import memory, programs
+from purerl.experiment import definition, loading, settings_json, source_hashes
 from purerl.experiment.objects import Setup, build, physics_hash
-from purerl.experiment.source_hashes import module_file, source_hashes
 from purerl.experiment.trust import load_copy
 from purerl.machine.output import Say
-from purerl.runs import checkpoint, checkpoint_folder, identity
+from purerl.runs import checkpoint, checkpoint_folder, manifest
 from purerl.runs.folder import CODE, CONFIG, Folder, check_manifest, read_run
 from purerl.runs.resume import edited
 
@@ -25,10 +20,10 @@ from purerl.runs.resume import edited
 class RestoredRun(NamedTuple):
     """A run read back from its folder alone."""
 
-    experiment: Experiment
+    experiment: definition.Experiment
     setup: Setup
     saved: checkpoint.Saved
-    source: Source  # the experiment as its file has it
+    source: loading.Source  # the experiment as its file has it
     folder: Folder
 
 
@@ -52,57 +47,50 @@ def restore(
     original = Path(begun["experiment_file"]).absolute()
     source = load_copy(run.path / CODE, run.code, run.config["experiment"], original, trust)
     settings = _fill(run.config["settings"], settings_json.to_json(source.experiment), say)
-    chosen = settings_json.from_json(
-        source.experiment, settings | ({"engine": engine} if engine else {})
-    )
+    settings |= {"engine": engine} if engine else {}
+    chosen = settings_json.from_json(source.experiment, settings)
     try:
         setup = build(chosen)
     except (UserError, RunError):
         raise
     except Exception as error:  # of code that trained: it, or its settings, is another since
-        what = f"{one_line(error)}{own_line(error)}"
+        what = f"{one_line(error)}{user_code.own_line(error)}"
         raise UserError(f"{folder} cannot be built with its {CONFIG}: {what}") from error
     for what in _changed_since(begun, source, setup):
         say(f"{folder}: {what} is not that of the run any more.")
     for what in edited(run):
         say(f"Edited since the run: {what}.")
-    return RestoredRun(chosen, setup, _read_checkpoint(run, update, setup, say), source, run)
+    return RestoredRun(chosen, setup, read_checkpoint(run, update, setup, say), source, run)
 
 
-def read_checkpoint(folder: Path, update: str, setup: Setup, say: Say) -> checkpoint.Saved:
-    """Reads a checkpoint of a run whose objects are built; arguments as for `restore`."""
-    return _read_checkpoint(read_run(folder), update, setup, say)
+def read_checkpoint(run: Folder, update: str, setup: Setup, say: Say) -> checkpoint.Saved:
+    """Reads a checkpoint of a run whose objects are built; arguments as for `restore`.
 
-
-def _read_checkpoint(run: Folder, update: str, setup: Setup, say: Say) -> checkpoint.Saved:
-    abstract = abstract_state(*setup[:3])
+    Raises UserError if this machine has no room to read a state of its size.
+    """
+    abstract = programs.abstract_state(*setup[:3])
     abstract = abstract.replace(env_state=None, episode=None, optimizer=None)
-    _check_memory(run.path, memory.size(abstract))
+    size, room = memory.size(abstract), memory.of_machine()
+    if 2 * size > room:  # a reader holds it twice
+        raise UserError(
+            f"The state of {run.path} takes {size / 1e9:,.0f} GB, by its config.json; this machine "
+            f"has {room / 1e9:,.0f} GB of memory."
+        )
     return _choose(run, update, abstract, say)
 
 
-def _check_memory(folder: Path, size: int) -> None:
-    """Raises UserError if this machine has no room to read a state of `size` bytes."""
-    if 2 * size > (room := memory.of_machine()):  # a reader holds it twice
-        raise UserError(
-            f"The state of {folder} takes {size / 1e9:,.0f} GB, by its config.json; this machine "
-            f"has {room / 1e9:,.0f} GB of memory."
-        )
-
-
-def _changed_since(begun: dict[str, Any], source: Source, setup: Setup) -> list[str]:
+def _changed_since(begun: dict[str, Any], source: loading.Source, setup: Setup) -> list[str]:
     """Lists what has changed since the run began and may change what its policy does."""
     builders = (source.experiment.build_env, source.experiment.build_network)
-    now, then = source_hashes(builders), begun["source"]
+    now, then = source_hashes.source_hashes(builders), begun["source"]
     edited = [name for name, value in now.items() if then.get(name) != value]
     # The run's own copy of its experiment, `source`, cannot have been edited.
-    edited = [name for name in edited if module_file(name) != source.path]
-    few = ", ".join(edited[:3]) + (f" and {len(edited) - 3} more" if len(edited) > 3 else "")
-    found = [f"The code of {few}"] if edited else []
+    edited = [name for name in edited if source_hashes.module_file(name) != source.path]
+    found = [f"The code of {findings.some(edited, 3)}"] if edited else []
     if setup.engine == begun["engine"] and physics_hash(setup.env) != begun["model"]:
         found.append("MuJoCo's model")
     held = begun.get("arrays")  # of older runs there is none
-    if not edited and held and held != hash_held(setup.env, setup.network):
+    if not edited and held and held != held_arrays.hash_held(setup.env, setup.network):
         found.append("The data that the environment or the network holds")
     return found
 
@@ -118,7 +106,7 @@ def _fill(old: Any, new: Any, say: Say, path: str = "") -> Any:
 
 def _choose(run: Folder, update: str, abstract: TrainState, say: Say) -> checkpoint.Saved:
     """Reads the checkpoint that was asked for; see `restore`."""
-    folder, owners = run.checkpoints, identity.owners(check_manifest(run))
+    folder, owners = run.checkpoints, manifest.owners(check_manifest(run))
     if update == "latest":
         whole = checkpoint.newest([folder], abstract, say, rename=False, owners=[owners])
         if not whole:
@@ -134,9 +122,8 @@ def _choose(run: Folder, update: str, abstract: TrainState, say: Say) -> checkpo
     if str(number) not in found:
         valid = ", ".join(["latest", "best", *found])
         raise UserError(f"There is no checkpoint {update!r} in {folder}. Valid: {valid}.")
+    path = checkpoint_folder.path_of(folder, int(number))
     try:
-        return checkpoint.load_checkpoint(
-            checkpoint_folder.path_of(folder, int(number)), abstract, owners
-        )
+        return checkpoint.load_checkpoint(path, abstract, owners)
     except checkpoint_folder.DamagedError as error:
         raise UserError(f"The checkpoint of update {number} is damaged: {error}.") from error

@@ -9,11 +9,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import UserError
-from purerl.experiment import settings_json
+from purerl.experiment import options, settings_json, source_hashes
 from purerl.experiment.definition import Experiment
 from purerl.experiment.loading import Source
-from purerl.experiment.options import Resume
-from purerl.experiment.source_hashes import hash_code
 from purerl.machine.files import draft_of
 from purerl.ppo.config import Config
 from purerl.runs import folder as run_folder, manifest
@@ -34,7 +32,7 @@ class Description(NamedTuple):
 
 
 def check_new_or_resume(
-    folders: Sequence[Folder], experiments: Sequence[Experiment], resume: Resume
+    folders: Sequence[Folder], experiments: Sequence[Experiment], resume: options.Resume
 ) -> None:
     """Raises UserError if a new run would overwrite something, or there is nothing to resume.
 
@@ -50,7 +48,7 @@ def check_new_or_resume(
         _check_usable(folder, chosen, resume)
 
 
-def _check_usable(folder: Folder, chosen: Experiment, resume: Resume) -> None:
+def _check_usable(folder: Folder, chosen: Experiment, resume: options.Resume) -> None:
     """Raises UserError if one folder may not be written."""
     run_folder.check_no_links(folder)
     if folder.is_begun and not resume:
@@ -107,12 +105,10 @@ def what_to_write(
     Raises:
       UserError: this process would not continue the run exactly; or it has nothing to train.
     """
-    if not folder.is_run:
-        return _identity(folder) | now.manifest
-    found = changes(folder, now)
-    if not found:
+    found = changes(folder, now) if folder.is_run else []
+    if folder.is_run and not found:
         return None
-    if not begun:
+    if not (folder.is_run and begun):
         return _identity(folder) | now.manifest
     if not allow_changes:
         raise UserError(
@@ -128,7 +124,7 @@ def changes(folder: Folder, now: Description) -> list[str]:
     """Returns in what this process would not continue the run exactly, a line each."""
     found = manifest.differences(folder.config, now.config)
     found += manifest.differences(check_manifest(folder), now.manifest)
-    if hash_code(folder.code) != hash_code(now.source.text):
+    if source_hashes.hash_code(folder.code) != source_hashes.hash_code(now.source.text):
         found.append(f"{CODE}: {now.source.path} has been edited")
     return found + edited(folder)
 
@@ -204,15 +200,14 @@ def _noted(folder: Folder, found: list[str]) -> dict[str, Any]:
     """
     old = folder.manifest
     known = {name: old[name] for name in ("run_id", "name")}
-    after = max(folder.updates, default=0)
-    entry: dict[str, Any] = {"after_update": after, "changes": found}
-    entry["fingerprint"] = old["fingerprint"]
+    noted = with_change(old, max(folder.updates, default=0), found)
     if known["name"] != folder.path.name:
-        entry, known = {"of": known} | entry, _identity(folder)
+        noted["allowed_changes"][-1]["of"], known = known, _identity(folder)
     had = {name: old[name] for name in ("had_checkpoint",) if name in old}
-    return known | had | with_change(old, entry)
+    return known | had | noted
 
 
-def with_change(facts: dict[str, Any], entry: dict[str, Any]) -> dict[str, Any]:
+def with_change(facts: dict[str, Any], after: int, found: list[str]) -> dict[str, Any]:
     """Returns the list of what --allow-changes let pass, as manifest.json has it, with one more."""
+    entry = {"after_update": after, "changes": found, "fingerprint": facts["fingerprint"]}
     return {"allowed_changes": [*facts.get("allowed_changes", []), entry]}

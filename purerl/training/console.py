@@ -11,8 +11,7 @@ import jax
 
 from purerl.checks.examine_network import trained
 from purerl.core.records import PyTree
-from purerl.devices import threads
-from purerl.devices.memory import size
+from purerl.devices import memory, threads
 from purerl.experiment.objects import Setup
 from purerl.machine import output
 from purerl.ppo.config import Config
@@ -59,7 +58,7 @@ def describe_plan(
         "checkpoints": _ticks(plan.checkpoints),
         "metrics": f"a line every {plan.log_every} updates",
         "parameters": f"{parameters:,}",
-        "state": f"{size(abstract) / 1e6:,.1f} MB",
+        "state": f"{memory.size(abstract) / 1e6:,.1f} MB",
         "engine": f"{setup.engine}{engine_remark(setup.engine, kind)}",
         "shards": number > 1 and f"{number}, {each}",
         "device": f"{devices} x {kind['kind']} ({kind['platform']})",

@@ -13,8 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from purerl.checks.check_env import forget_lost, lost_part
-from purerl.checks.user_code import users_errors
+from purerl.checks import check_env, user_code
 from purerl.core.errors import RunError, StoppedError
 from purerl.core.records import Metrics, PyTree, TrainState, count_as_int
 from purerl.devices.programs import Programs
@@ -59,7 +58,7 @@ def train(
       StoppedError: stopped on request, saved.
       RunError: the numbers are no longer finite, or the last checkpoint could not be saved.
     """
-    forget_lost()
+    check_env.forget_lost()
     number = len(writers)
     first = update = safe = meta["update"]  # safe: a kill after this update loses nothing
     begin = time.perf_counter()
@@ -92,7 +91,7 @@ def train(
         left = (plan.updates - update) / rate
         progress.show(shown := shown_record(records), left, rate * plan.steps_per_update * number)
         if listener:
-            with users_errors("on_metrics: "):
+            with user_code.users_errors("on_metrics: "):
                 listener(shown)
     for writer in writers:
         writer.finish()
@@ -230,7 +229,7 @@ def _why_lost(programs: Programs, state: Any, records: Sequence[Record], seed: i
     if not nowhere and skipped < MAX_SKIPPED_IN_A_ROW:
         return ""
     whole = programs.fetch(state)
-    part, policy = lost_part(whole.env_state), jax.device_get(programs.policy(whole))
+    part, policy = check_env.lost_part(whole.env_state), jax.device_get(programs.policy(whole))
     loc, scale = _each_seed(policy, len(records))[seed]
     # Where observations are not sound, the policy cannot be.
     if not part and not (np.isfinite(loc + scale).all() and np.min(scale) >= LEAST_SCALE):

@@ -17,30 +17,22 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from purerl.checks.examine_env import tell_first
-from purerl.checks.user_code import program_errors
+from purerl.checks import examine_env, user_code
 from purerl.core.errors import RunError, UserError
 from purerl.core.records import PyTree, TrainState
 from purerl.devices import processes
 from purerl.devices.processes import in_first_process, kept_by_first
 from purerl.devices.programs import Programs, compile_programs
 from purerl.devices.shards import Shards
-from purerl.experiment import objects
-from purerl.experiment.definition import Experiment
-from purerl.experiment.objects import Setup
+from purerl.experiment import definition, objects
 from purerl.experiment.options import RunOptions
-from purerl.machine import output
-from purerl.machine.command_errors import tell
-from purerl.machine.files import disk_errors
+from purerl.machine import command_errors, files, output
 from purerl.machine.lock import FolderLock
-from purerl.machine.output import Say
 from purerl.ppo.algorithm import start_stage
-from purerl.runs import checkpoint, checkpoint_folder, identity, manifest
+from purerl.runs import checkpoint, checkpoint_folder, manifest, resume
 from purerl.runs.folder import CHECKPOINTS, Folder, check_manifest, note
 from purerl.runs.metrics_file import MetricsFile, Record, keep_whole_lines
-from purerl.runs.resume import begins_stage, with_change
-from purerl.training import console, loop
-from purerl.training.loggers import open_loggers
+from purerl.training import console, loggers, loop
 from purerl.training.plan import Plan
 from purerl.training.writer import RunWriter
 
@@ -51,8 +43,8 @@ class Job(NamedTuple):
     """What the seeds of one command have in common; no disk is read for it."""
 
     options: RunOptions
-    chosen: Experiment  # of the first seed
-    setup: Setup
+    chosen: definition.Experiment  # of the first seed
+    setup: objects.Setup
     abstract: PyTree  # shapes of one seed's state
     shards: Shards
     plan: Plan
@@ -82,7 +74,7 @@ def train_all(job: Job, seeds: list[Seed]) -> None:
         except RunError as error:  # the seeds after it can still be trained
             failed.append(str(error))
             if len(groups) > 1:  # they may take long, or be stopped
-                tell(error)
+                command_errors.tell(error)
     if failed:
         raise RunError(" ".join(failed))
 
@@ -113,7 +105,7 @@ def _train_together(job: Job, seeds: list[Seed], programs: Callable[[], Programs
         if processes.is_first():
             progress = stack.enter_context(console.progress(job.plan.updates))
         say = progress.say
-        saved = kept_by_first(disk_errors()(lambda: _newest(job, seeds, say))) or []
+        saved = kept_by_first(files.disk_errors()(lambda: _newest(job, seeds, say))) or []
         known = in_first_process(lambda: _known(saved))
         if known["update"] >= job.plan.updates:
             for one in saved:
@@ -125,20 +117,20 @@ def _train_together(job: Job, seeds: list[Seed], programs: Callable[[], Programs
         for one in saved:
             say(f"Resuming after update {one.meta['update']}. Digest {one.meta['digest']}")
         state = _first_state(known["found"], saved, seeds, job, compiled)
-        tell_first(None if known["found"] else state.env_state, say)
+        examine_env.tell_first(None if known["found"] else state.env_state, say)
         writers: list[Any] = [processes.Silent(seed.path / CHECKPOINTS) for seed in seeds]
         if processes.is_first():
-            with disk_errors():
+            with files.disk_errors():
                 exactness = manifest.with_unordered(job.facts, _unordered(compiled))
                 seeds = [s._replace(folder=note(s.folder, **exactness)) for s in seeds if s.folder]
                 writers = _open_writers(seeds, saved, job, say)
             for writer in writers:
                 stack.callback(writer.close)
-                writer.loggers = open_loggers(job.options, writer.folder, say)
+                writer.loggers = loggers.open_loggers(job.options, writer.folder, say)
         meta = {name: known[name] for name in ("wall_s", "update")}
         best = in_first_process(lambda: [writer.best() for writer in writers])
         stop = processes.agreed(job.stop)
-        with program_errors():
+        with user_code.program_errors():
             state = compiled.spread(state)
             loop.train(job.plan, compiled, state, writers, progress, stop, meta, best, job.listener)
         for seed, writer in zip(seeds, writers, strict=True):
@@ -146,7 +138,7 @@ def _train_together(job: Job, seeds: list[Seed], programs: Callable[[], Programs
             say(f"Done: {job.plan.steps:,} steps{of}. Digest {writer.digest}")
 
 
-def _newest(job: Job, seeds: list[Seed], say: Say) -> list[checkpoint.Saved]:
+def _newest(job: Job, seeds: list[Seed], say: output.Say) -> list[checkpoint.Saved]:
     """Reads the newest checkpoint that all seeds have; [] where they begin.
 
     Raises:
@@ -155,7 +147,7 @@ def _newest(job: Job, seeds: list[Seed], say: Say) -> list[checkpoint.Saved]:
     folders = [seed.folder for seed in seeds if seed.folder]
     places = [folder.checkpoints for folder in folders]
     facts = list(map(check_manifest, folders))
-    saved = checkpoint.newest(places, job.abstract, say, owners=list(map(identity.owners, facts)))
+    saved = checkpoint.newest(places, job.abstract, say, owners=list(map(manifest.owners, facts)))
     if not saved:
         promised = any(one.get("had_checkpoint") for one in facts)
         checkpoint_folder.check_none_lost(places, promised)
@@ -186,12 +178,12 @@ def _first_state(
 
 def _as_it_goes_on(seed: Seed, saved: checkpoint.Saved) -> TrainState:
     """Returns a saved state; where a stage begins, ready for its reward."""
-    begins = seed.folder and begins_stage(seed.folder, saved.meta["update"])
+    begins = seed.folder and resume.begins_stage(seed.folder, saved.meta["update"])
     return start_stage(saved.state) if begins else saved.state
 
 
 def _open_writers(
-    seeds: list[Seed], saved: list[checkpoint.Saved], job: Job, say: Say
+    seeds: list[Seed], saved: list[checkpoint.Saved], job: Job, say: output.Say
 ) -> list[RunWriter]:
     """Opens what writes each seed's folder, cut back to the checkpoints `saved`."""
     worker = ThreadPoolExecutor(1, "purerl-writer")
@@ -208,7 +200,7 @@ def _open_writers(
 
 
 def _open_metrics(
-    folder: Folder, meta: Record, allow_changes: bool, say: Say
+    folder: Folder, meta: Record, allow_changes: bool, say: output.Say
 ) -> tuple[Folder, MetricsFile]:
     """Opens metrics.jsonl where a checkpoint left it; UserError if it is not what it was."""
     try:
@@ -219,7 +211,5 @@ def _open_metrics(
     change = f"{folder.metrics.name}: it was not what the run wrote; its whole lines are kept"
     say(change)
     place = keep_whole_lines(folder.metrics, meta["update"])
-    entry = {"after_update": meta["update"], "changes": [change]}
-    entry["fingerprint"] = folder.manifest["fingerprint"]
-    folder = note(folder, **with_change(folder.manifest, entry))
+    folder = note(folder, **resume.with_change(folder.manifest, meta["update"], [change]))
     return folder, MetricsFile(folder.metrics, *place)

@@ -13,29 +13,28 @@ import jax
 
 from purerl import exact
 from purerl.checks.held_arrays import hash_held
+from purerl.checks.user_code import users_errors
 from purerl.core.errors import UserError
 from purerl.core.records import PyTree
-from purerl.devices import compilation, processes
+from purerl.devices import compilation, processes, programs
 from purerl.devices.check_sizes import check_minibatches, check_shards
 from purerl.devices.processes import in_first_process, kept_by_first
-from purerl.devices.programs import abstract_state
 from purerl.devices.shards import Shards
 from purerl.experiment import objects
 from purerl.experiment.definition import Experiment
 from purerl.experiment.loading import Source
-from purerl.experiment.objects import Setup
 from purerl.experiment.options import RunOptions
-from purerl.machine import output
-from purerl.machine.files import disk_errors
+from purerl.machine import files, output
 from purerl.machine.lock import FolderLock
 from purerl.ppo.config import Config
 from purerl.ppo.learner import is_recurrent
 from purerl.runs import checkpoint, folder as run_folder, manifest, resume
 from purerl.runs.folder import Folder, check_manifest
-from purerl.training import console
-from purerl.training.loggers import check_loggers
+from purerl.training import console, loggers
 from purerl.training.plan import make_plan
 from purerl.training.seeds import Job, Seed, train_all
+
+Stop = Callable[[], bool]  # tells whether a signal asked to stop
 
 
 def execute(
@@ -43,7 +42,7 @@ def execute(
     runs: dict[Path, Experiment],
     found: Sequence[Folder],
     options: RunOptions,
-    stop: Callable[[], bool],
+    stop: Stop,
     listener: Any = None,
 ) -> None:
     """Prepares the folders and the programs, and trains.
@@ -60,24 +59,19 @@ def execute(
         processes.start(options.distributed)
         experiments = list(runs.values())
         in_first_process(lambda: resume.check_new_or_resume(found, experiments, options.resume))
-        check_loggers(options)
+        loggers.check_loggers(options)
         cache = compilation.set_up_jax(options.cache)
         job = prepare(source, experiments[0], found, options, stop)._replace(listener=listener)
-        seeds = begin(source, runs, job, cache, stack)
-        train_all(job, seeds)
+        train_all(job, begin(source, runs, job, cache, stack))
 
 
 def prepare(
-    source: Source,
-    chosen: Experiment,
-    found: Sequence[Folder],
-    options: RunOptions,
-    stop: Callable[[], bool],
+    source: Source, chosen: Experiment, found: Sequence[Folder], options: RunOptions, stop: Stop
 ) -> Job:
     """Builds the experiment's objects, and says how they will be trained; arguments as above."""
     with compilation.no_collection():
         setup = objects.build(chosen)
-        abstract = abstract_state(*setup[:3])
+        abstract = programs.abstract_state(*setup[:3])
     begun_with = in_first_process(lambda: _shards_begun_with(found))
     shards = _choose_shards(setup.config, abstract, options, begun_with)
     objects.check_memory(setup, abstract, options.vmapped_seeds, shards.devices)
@@ -106,17 +100,15 @@ def _choose_shards(
             f"with --num-shards {devices}."
         )
     shards = Shards(number, devices if number > 1 else 1)
-    try:
+    with users_errors(""):
         check_shards(shards, config.num_envs)
         name = "num_envs / num_shards" if number > 1 else "num_envs"
         check_minibatches(config, is_recurrent(abstract.memory), config.num_envs // number, name)
-    except ValueError as error:
-        raise UserError(str(error)) from error
     return shards
 
 
 def _facts(
-    source: Source, chosen: Experiment, options: RunOptions, setup: Setup, shards: Shards
+    source: Source, chosen: Experiment, options: RunOptions, setup: objects.Setup, shards: Shards
 ) -> dict[str, Any]:
     """Returns what manifest.json says of a run that begins now."""
     builders = (chosen.build_env, chosen.build_network)
@@ -145,7 +137,7 @@ def begin(
       stack: gives the locks back at its end.
     """
 
-    @disk_errors()
+    @files.disk_errors()
     def locked() -> list[Seed]:
         locks = []
         for path in runs:

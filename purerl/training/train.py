@@ -16,16 +16,12 @@ from typing import Any, Unpack, overload
 from purerl.core.errors import UserError
 from purerl.devices import threads
 from purerl.exact import xla_flags
-from purerl.experiment import settings_json
-from purerl.experiment.command_line import Over, from_settings
+from purerl.experiment import command_line, settings_json, trust
 from purerl.experiment.definition import Experiment
 from purerl.experiment.loading import Source, find_source
 from purerl.experiment.options import RunOptions, TrainOptions, check_seed
 from purerl.experiment.source_hashes import hash_code
-from purerl.experiment.trust import remember
-from purerl.machine import output
-from purerl.machine.files import check_name, check_object, read_bytes, read_json
-from purerl.machine.signals import stop_signals
+from purerl.machine import files, output, signals
 from purerl.runs.loaded_run import Run
 
 
@@ -86,7 +82,7 @@ def train(
     if not (listener is None or callable(listener)):
         raise UserError(f"on_metrics is {listener!r}; it must be a function of a line of metrics.")
     source = find_source(str(experiment))
-    chosen, how = from_settings(source, settings or {}, options, choose=as_begun)
+    chosen, how = command_line.from_settings(source, settings or {}, options, choose=as_begun)
     if how.video:
         raise UserError("video is an option of the command; call `python -m purerl.render RUN`.")
     runs = [Run(path, trust=True) for path in train_runs(source, chosen, how, _raise, listener)]
@@ -108,22 +104,22 @@ def train_runs(
     from purerl.runs import folder, manifest
     from purerl.training.session import execute
 
-    check_name("The experiment's name", source.name)
+    files.check_name("The experiment's name", source.name)
     if options.name is not None:
-        check_name("name", options.name)
+        files.check_name("name", options.name)
     runs = _folders(source, chosen, options)
-    remember(source.text, source.path)
+    trust.remember(source.text, source.path)
     found = [folder.read(path) for path in runs]
     begun_portable = options.resume and any(manifest.was_portable(one.manifest) for one in found)
     if options.portable or begun_portable:
         set_portable_flags_in_time()
     threads.leave_one(chosen.engine)
-    with stop_signals(end) as stop:
+    with signals.stop_signals(end) as stop:
         execute(source, runs, found, options, stop, listener)
     return list(runs)
 
 
-def as_begun(source: Source, over: Over) -> tuple[Experiment, RunOptions]:
+def as_begun(source: Source, over: command_line.Over) -> tuple[Experiment, RunOptions]:
     """Returns what a command line makes of the settings that a run which goes on was begun with.
 
     So what the command leaves out stays as it is. Where the experiment's file has been edited since
@@ -143,9 +139,9 @@ def as_begun(source: Source, over: Over) -> tuple[Experiment, RunOptions]:
     if not checkpoint_folder.updates(place / folder.CHECKPOINTS):
         return known
     with contextlib.suppress(UserError):  # told where the folder is read as a run's
-        if hash_code(read_bytes(place / folder.CODE)) == hash_code(source.text):
-            begun = read_json(place / folder.CONFIG, settings=dict, schedule=dict)
-            schedule = check_object("", begun["schedule"], log_every=int, checkpoints=int)
+        if hash_code(files.read_bytes(place / folder.CODE)) == hash_code(source.text):
+            begun = files.read_json(place / folder.CONFIG, settings=dict, schedule=dict)
+            schedule = files.check_object("", begun["schedule"], log_every=int, checkpoints=int)
             both = {name: schedule[name] for name in ("log_every", "checkpoints")}
             known = over(settings_json.from_json(source.experiment, begun["settings"]), **both)
     if unlike := manifest.differences(*map(settings_json.to_json, (chosen, known[0]))):

@@ -4,16 +4,14 @@ The order matters: a checkpoint says how long metrics.jsonl was when it was take
 when the disk has all of that. Training does not wait for hashes or the disk.
 """
 
-import math
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import RunError, UserError, one_line
-from purerl.machine.files import make_folder
+from purerl.machine import files, output
 from purerl.machine.lock import FolderLock
-from purerl.machine.output import Say
 from purerl.machine.state_arrays import Leaves, digest_leaves
 from purerl.runs import checkpoint, checkpoint_folder
 from purerl.runs.folder import Folder, note
@@ -32,7 +30,7 @@ class RunWriter:
         metrics: MetricsFile,
         lock: FolderLock,
         keep: int,
-        say: Say,
+        say: output.Say,
         worker: ThreadPoolExecutor,
         together: Sequence[Path],
     ) -> None:
@@ -50,7 +48,7 @@ class RunWriter:
             They keep the checkpoints that all of them have.
         """
         self.folder, self.checkpoints = folder, folder.checkpoints
-        make_folder(self.checkpoints)
+        files.make_folder(self.checkpoints)
         checkpoint_folder.clean(self.checkpoints)
         self.lock, self.metrics = lock, metrics
         self.signature = {name: folder.manifest[name] for name in ("run_id", "fingerprint")}
@@ -85,7 +83,7 @@ class RunWriter:
     def best(self) -> float:
         """Returns the highest evaluation return that a checkpoint of this stage has, else -inf."""
         stages = checkpoint_folder.best_by_stage(self.checkpoints)
-        return stages.get(self.signature["fingerprint"], (-math.inf, 0))[0]
+        return stages.get(self.signature["fingerprint"], (float("-inf"), 0))[0]
 
     def finish(self) -> None:
         """Waits until everything is on the disk; RunError if the last checkpoint is not."""

@@ -1,20 +1,17 @@
 """What is planned for or looked at: an experiment, or a run with what it has learned."""
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import UserError
-from purerl.experiment import loading
+from purerl.experiment import definition, loading
 from purerl.experiment.command_line import from_command_line, parse
-from purerl.experiment.definition import Experiment
-from purerl.experiment.loading import Source
 from purerl.experiment.options import check_seed
 from purerl.machine import output
-from purerl.runs.folder import CODE
-from purerl.runs.loaded_run import Run, load
+from purerl.runs import folder, loaded_run
 from purerl.tune.plan.settings import Settings
 
 SETTABLE = ("env", "engine")  # of an experiment's settings
@@ -42,8 +39,8 @@ class Subject(NamedTuple):
     """What a command's first word names."""
 
     name: str  # the word
-    source: Source  # the experiment, a run's with the run's settings
-    run: Run | None  # if it is one
+    source: loading.Source  # the experiment, a run's with the run's settings
+    run: loaded_run.Run | None  # if it is one
 
 
 def show_help(base: Any, about: str | None, prog: str, words: Sequence[str]) -> None:
@@ -72,8 +69,7 @@ def find(words: Sequence[str], prog: str) -> Subject:
     if not Path(name).is_dir():
         return Subject(name, loading.find_source(name), None)
     # Options that say how to read the run, whose experiment says which other options there are.
-    early: Callable[..., Any] = argparse.ArgumentParser
-    parser = early(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--checkpoint", default="latest")
     parser.add_argument("--engine", default="")
     parser.add_argument("--trust", action="store_true")
@@ -81,13 +77,13 @@ def find(words: Sequence[str], prog: str) -> Subject:
         known, _ = parser.parse_known_args(words[1:])
     except argparse.ArgumentError as error:
         raise UserError(f"The command line is wrong: {error}.") from error
-    run = load(name, known.checkpoint, known.engine, known.trust)
-    return Subject(name, Source(run.experiment, name, Path(name) / CODE), run)
+    run = loaded_run.load(name, known.checkpoint, known.engine, known.trust)
+    return Subject(name, loading.Source(run.experiment, name, Path(name) / folder.CODE), run)
 
 
 def chosen(
     subject: Subject, words: Sequence[str], prog: str, base: Any, names: Sequence[str] = SETTABLE
-) -> tuple[Experiment, Any]:
+) -> tuple[definition.Experiment, Any]:
     """Returns the subject's experiment with the settings that the words give, and the options.
 
     Args:

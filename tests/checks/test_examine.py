@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from purerl.checks import check_env, examine_env, examine_network
-from purerl.checks.examine_model import check_model, check_ranges
-from purerl.checks.watch_physics import check_controls, check_placed
+from purerl.checks.examine_physics import check_controls, check_model, check_placed, check_ranges
 from purerl.core.records import Network, Normal, PolicyOutput
 from purerl.devices import memory
 from purerl.devices.programs import abstract_state

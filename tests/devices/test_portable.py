@@ -28,7 +28,7 @@ from purerl.training import train
 toy, runs = sys.argv[1:]
 purerl.train(toy, name="whole", runs=runs, portable=True)
 asked = itertools.chain([False] * 4, itertools.repeat(True))
-train.stop_signals = lambda _: contextlib.nullcontext(lambda: next(asked))
+train.signals.stop_signals = lambda _: contextlib.nullcontext(lambda: next(asked))
 with contextlib.suppress(purerl.StoppedError):
     purerl.train(toy, name="half", runs=runs, portable=True)
 """

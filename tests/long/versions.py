@@ -27,7 +27,7 @@ import contextlib, itertools, sys
 import purerl
 from purerl.training import train
 asked = itertools.chain([False] * 9, itertools.repeat(True))
-train.stop_signals = lambda _: contextlib.nullcontext(lambda: next(asked))
+train.signals.stop_signals = lambda _: contextlib.nullcontext(lambda: next(asked))
 with contextlib.suppress(purerl.StoppedError):
     purerl.train({TOY!r}, runs=sys.argv[1], name="run")
 """

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from purerl.physics import constants, lookup, reasons
+from purerl.physics import changes as fields, lookup, reasons
 from purerl.physics.changes import CHANGEABLE_FIELDS, CONSTANTS, consequences
 from purerl.physics.interface import Physics
 
@@ -134,7 +134,7 @@ def test_what_is_derived_is_what_the_compiler_has(model, name):
     row = np.ravel(getattr(right, name))[None].astype(np.float32)
     found, end = copy.copy(model), 0
     getattr(found, name)[...] = getattr(right, name)
-    values = constants._derive_rows(model, (name,), wanted, row) if wanted else None
+    values = fields._derive_rows(model, (name,), wanted, row) if wanted else None
     for constant in wanted:
         field = getattr(found, constant)
         field[...] = values[0, end : end + field.size].reshape(field.shape)

@@ -16,7 +16,8 @@ from purerl import exact
 from purerl.envs import run
 from purerl.exact.traces import equations
 from purerl.physics import lookup
-from purerl.physics.interface import CHANGEABLE_FIELDS, READINGS, Physics, choose_engine
+from purerl.physics.changes import CHANGEABLE_FIELDS
+from purerl.physics.interface import READINGS, Physics, choose_engine
 from tests import quick
 
 # Two legs that touch a floor, a ball, a tendon, a filtered motor, a mocap body and sensors.

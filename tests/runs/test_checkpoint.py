@@ -235,7 +235,7 @@ def test_a_failed_save_leaves_nothing_and_the_older_one_whole(tmp_path, monkeypa
     def full(path):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(checkpoint, "sync_tree", full)
+    monkeypatch.setattr(checkpoint.files, "sync_tree", full)
     with pytest.raises(OSError, match="No space"):
         save(tmp_path, 2)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["000000000001"]

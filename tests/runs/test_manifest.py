@@ -22,7 +22,7 @@ from purerl.experiment.objects import build
 from purerl.ppo import algorithm
 from purerl.ppo.config import Evaluation
 from purerl.runs import manifest, resume
-from purerl.runs.identity import fingerprint
+from purerl.runs.manifest import fingerprint
 
 ROOT = Path(__file__).parent.parent.parent
 TOY = Path(__file__).parent / "toy_experiment.py"

@@ -92,7 +92,7 @@ def stop_after(monkeypatch):
     """Makes the next run stop by itself after some questions."""
 
     def use(questions: int) -> None:
-        monkeypatch.setattr(train, "stop_signals", lambda _: one(questions))
+        monkeypatch.setattr(train.signals, "stop_signals", lambda _: one(questions))
 
     @contextlib.contextmanager
     def one(questions):
@@ -624,7 +624,7 @@ def test_the_second_signal_ends_at_once(monkeypatch, capsys):
     ended = []
     before = signal.getsignal(signal.SIGINT)  # not Python's own in a background job
     monkeypatch.setattr(os, "_exit", ended.append)
-    with train.stop_signals(os._exit) as stop:
+    with train.signals.stop_signals(os._exit) as stop:
         assert not stop()
         os.kill(os.getpid(), signal.SIGTERM)
         assert stop() and not ended

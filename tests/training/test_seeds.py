@@ -42,7 +42,7 @@ def stop_after(monkeypatch):
         def signals(_):
             yield Stopper(questions)
 
-        monkeypatch.setattr(train, "stop_signals", signals)
+        monkeypatch.setattr(train.signals, "stop_signals", signals)
 
     return use
 

@@ -122,7 +122,7 @@ def test_a_run_that_was_stopped_goes_on(trained, tmp_path, monkeypatch):
     asked = iter([False, False, True])
     stop = lambda _: contextlib.nullcontext(lambda: next(asked, True))  # noqa: E731
     with monkeypatch.context() as patch:
-        patch.setattr(train, "stop_signals", stop)
+        patch.setattr(train.signals, "stop_signals", stop)
         with pytest.raises(purerl.StoppedError, match="it is saved"):
             purerl.train(str(TOY), SETTINGS, runs=tmp_path)
     run_ = purerl.train(str(TOY), SETTINGS, runs=tmp_path, resume=True)
@@ -277,7 +277,7 @@ def test_flags_that_come_too_late_for_a_gpu_are_not_claimed(monkeypatch, capsys,
 
 def test_a_second_signal_interrupts_and_the_handlers_come_back(capsys):
     before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt), train.stop_signals(train._raise) as stop:
+    with pytest.raises(KeyboardInterrupt), train.signals.stop_signals(train._raise) as stop:
         os.kill(os.getpid(), signal.SIGTERM)
         assert stop()
         os.kill(os.getpid(), signal.SIGTERM)

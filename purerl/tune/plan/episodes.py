@@ -15,9 +15,7 @@ from purerl.core.records import Array
 from purerl.devices.compilation import jit
 from purerl.ppo import evaluation
 from purerl.ppo.config import Config
-from purerl.ppo.evaluation import Progress
 from purerl.tune.plan import planner
-from purerl.tune.plan.planner import Guide, Plan
 from purerl.tune.plan.settings import Settings
 
 TERM = "reward_"  # the name of a metric that is a term of the reward begins so
@@ -27,8 +25,8 @@ CHUNK = 20  # control steps that one call of the program plays
 class Playing(NamedTuple):
     """Episodes that are being played, [E, ...]."""
 
-    progress: Progress
-    plan: Plan
+    progress: evaluation.Progress
+    plan: planner.Plan
 
 
 def advance(
@@ -36,7 +34,7 @@ def advance(
     env: Env,
     judges: Mapping[str, Env],
     keep: Callable[[State], Any],
-    guide: Guide,
+    guide: planner.Guide,
     key: Array,
     playing: Playing,
 ) -> tuple[Playing, dict[str, Any]]:
@@ -57,8 +55,7 @@ def advance(
       to the episode, "kept", "action", "reward", "metrics" and "judged".
     """
     now, number = playing.progress, len(playing.progress.over)
-    step_key = jax.random.fold_in(key, now.t)
-    keys = per_environment(step_key, jnp.arange(number))
+    keys = per_environment(jax.random.fold_in(key, now.t), jnp.arange(number))
     choose = functools.partial(planner.plan, settings, env, guide)
     plans, action = jax.vmap(choose)(playing.plan, now.env_state, keys)
     following = evaluation.advance(env, now, action, ())
@@ -88,7 +85,7 @@ def episodes(
     config: Config,
     settings: Settings,
     env: Env,
-    make_guide: Callable[[Any], Guide],
+    make_guide: Callable[[Any], planner.Guide],
     learned: Any,
     seed: int,
     number: int,

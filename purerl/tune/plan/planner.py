@@ -88,9 +88,7 @@ def unguided(action_size: int) -> Guide:
 
 def guide_of(config: Config, env: Env, network: Network, learned: TrainState | None) -> Guide:
     """Returns the guide of what was learned; of nothing, None, `unguided`."""
-    if learned is None:
-        return unguided(env.action_size)
-    return guide(config, network, learned)
+    return unguided(env.action_size) if learned is None else guide(config, network, learned)
 
 
 def start(settings: Settings, env: Env, guide: Guide) -> Plan:

@@ -16,8 +16,7 @@ from purerl.core.env import Env
 from purerl.core.errors import StoppedError
 from purerl.experiment.objects import naming_broken_rules
 from purerl.machine import output
-from purerl.report.episode_pictures import recording_of, take_picture
-from purerl.report.video import draw, renderer_of
+from purerl.report import episode_pictures, video
 from purerl.tune.plan import episodes, figures, planner
 
 FRAME = (640, 480)  # of a video [pixels]
@@ -52,7 +51,7 @@ def play(problem: Any, options: Any, judges: dict[str, Any], stop: Callable[[], 
     guide = functools.partial(planner.guide_of, config, env, network)
     # Episodes that begin alike are known by what is observed.
     observation = operator.attrgetter("observation")
-    keep = functools.partial(take_picture, env) if options.video else observation
+    keep = functools.partial(episode_pictures.take_picture, env) if options.video else observation
     game = (config, options, env, guide, problem.learned, options.seed, options.episodes)
     rows: list[Any] = []
     begin = spoke = time.perf_counter()
@@ -89,9 +88,9 @@ def film(path: Path, env: Env, end: episodes.Playing, rows: Sequence[dict[str, A
     """
     kept = [(row["kept"], row["running"]) for row in rows]
     pictures, running = jax.tree.map(lambda *parts: np.concatenate(parts), *kept)
-    recording = jax.device_get(recording_of(env, pictures, running, end.progress))
-    with renderer_of(env, FRAME) as renderer:
-        draw(path, renderer, recording, env.control_timestep)
+    recording = jax.device_get(episode_pictures.recording_of(env, pictures, running, end.progress))
+    with video.renderer_of(env, FRAME) as renderer:
+        video.draw(path, renderer, recording, env.control_timestep)
 
 
 def wait(arrays: Any) -> None:

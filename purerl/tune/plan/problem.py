@@ -8,12 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import UserError, check_least
-from purerl.experiment.definition import Experiment
-from purerl.experiment.objects import Setup, build
-from purerl.experiment.settings_json import to_json
+from purerl.experiment import definition, objects, settings_json
 from purerl.machine.files import check_writable
-from purerl.tune import subject
-from purerl.tune.overrides import environment_words
+from purerl.tune import overrides, subject
 from purerl.tune.subject import PlanOptions, Subject
 
 AGAINST = "--against"
@@ -62,7 +59,7 @@ class Problem(NamedTuple):
     title: str  # of its column
     words: str  # the settings of the environment that are not those of the experiment's file
     settings: dict[str, Any]  # all of them, as config.json has a run's
-    setup: Setup
+    setup: objects.Setup
     learned: Any  # a run's TrainState; None: nothing
     trained: str  # what of a run that is, in words
 
@@ -103,15 +100,15 @@ def read(words: Sequence[str], prog: str) -> tuple[Problem, Problem | None, Plan
     return first, second, options
 
 
-def _problem(found: Subject, chosen: Experiment, options: PlanCommandOptions) -> Problem:
+def _problem(found: Subject, chosen: definition.Experiment, options: PlanCommandOptions) -> Problem:
     run = None if options.no_policy else found.run
     written = found.source if found.run is None else found.run.restored.source
     return Problem(
         name=found.name,
         title=options.planner if run is None else f"{options.planner} + policy",
-        words=" ".join(environment_words(written.experiment, chosen.env)),
-        settings=to_json(chosen)["env"],
-        setup=build(chosen),
+        words=" ".join(overrides.environment_words(written.experiment, chosen.env)),
+        settings=settings_json.to_json(chosen)["env"],
+        setup=objects.build(chosen),
         learned=None if run is None else run.state,
         trained="" if run is None else f"update {run.update:,} ({run.steps:,} steps)",
     )

@@ -12,13 +12,11 @@ from typing import Annotated, Any
 import tyro
 
 from purerl.core.errors import UserError, check_least, nearest, one_line, unknown_name
-from purerl.experiment import command_line
-from purerl.experiment.loading import find_source
+from purerl.experiment import command_line, loading
 from purerl.experiment.options import RunOptions
 from purerl.machine.files import check_name, read_bytes
 from purerl.report.run_reader import flatten
 from purerl.tune.sweep import points
-from purerl.tune.sweep.points import Base
 
 PROG = "python -m purerl.sweep"
 # Options of a run that a sweep gives itself, and what to say instead.
@@ -68,7 +66,7 @@ class SweepOptions:
 OWN = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(SweepOptions)}
 
 
-def read(arguments: Sequence[str]) -> tuple[SweepOptions, Base, list[str]]:
+def read(arguments: Sequence[str]) -> tuple[SweepOptions, points.Base, list[str]]:
     """Reads a whole command line.
 
     Returns:
@@ -88,9 +86,9 @@ def read(arguments: Sequence[str]) -> tuple[SweepOptions, Base, list[str]]:
     options, rest = command_line.parse(SweepOptions, words, PROG, return_unknown_args=True)
     if options.name:
         check_name("name", options.name)
-    source = find_source(named)
+    source = loading.find_source(named)
     folder = options.sweeps / (options.name or source.name)
-    base = Base(named, source, source.experiment, (), options.seeds, folder, RunOptions())
+    base = points.Base(named, source, source.experiment, (), options.seeds, folder, RunOptions())
     for name, value in settings.items():
         rest += points.option_words(base, name, _text(name, value))
     chosen, of_run = _read_settings(source, named, rest)

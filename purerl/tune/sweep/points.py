@@ -10,11 +10,8 @@ from typing import Annotated, Any, NamedTuple
 import tyro
 
 from purerl.core.errors import UserError, one_line
-from purerl.experiment import other_trainers, settings_json
+from purerl.experiment import definition, kinds, loading, other_trainers, settings_json
 from purerl.experiment.command_line import WORDS, parse
-from purerl.experiment.definition import Experiment
-from purerl.experiment.kinds import hints
-from purerl.experiment.loading import Source
 from purerl.experiment.options import RunOptions
 from purerl.tune.option_numbers import Place, replaced
 from purerl.tune.sweep.scheduler import Job
@@ -37,8 +34,8 @@ class Base(NamedTuple):
     """What all points have in common."""
 
     experiment: str  # as the user named it
-    source: Source  # of the experiment
-    chosen: Experiment  # with the settings that all points share
+    source: loading.Source  # of the experiment
+    chosen: definition.Experiment  # with the settings that all points share
     words: tuple[str, ...]  # of the run command, those of the points excepted
     seeds: int
     folder: Path  # of the sweep
@@ -81,8 +78,7 @@ def setting(base: Base, name: str) -> Any:
         raise UserError("Each point is trained with several seeds already: give --seeds 3.")
     names = _names(base.chosen)
     if name not in names:
-        hint = other_trainers.suggest(name, names)
-        said = f"There is no setting {name!r}. {hint}".strip()
+        said = f"There is no setting {name!r}. {other_trainers.suggest(name, names)}".strip()
         page = f"python -m purerl.run {shlex.quote(base.experiment)} --help"
         raise UserError(f"{said} All settings: {page}")
     return names[name]
@@ -102,7 +98,7 @@ def read_value(base: Base, name: str, text: str) -> Any:
     """Returns a setting's value of the type that it has; UserError if it is of another."""
     *path, last = name.replace("-", "_").split(".")
     owner: Any = functools.reduce(getattr, path, base.chosen)
-    kind = hints(type(owner)).get(last, type(getattr(owner, last)))
+    kind = kinds.hints(type(owner)).get(last, type(getattr(owner, last)))
     # A class with this setting alone: rules that join several settings come later, in `check`.
     one: Any = Annotated[kind, tyro.conf.arg(name=name)]
     alone = dataclasses.make_dataclass("Alone", [("value", one)], frozen=True)
@@ -171,7 +167,6 @@ def job(base: Base, point: Point) -> Job:
     names = [point.name]
     if base.seeds > 1:
         words += ["--num-seeds", str(base.seeds)]
-        first = base.chosen.seed
-        names = [f"{point.name}-seed{first + i}" for i in range(base.seeds)]
+        names = [f"{point.name}-seed{base.chosen.seed + i}" for i in range(base.seeds)]
     folders = tuple(base.folder / base.source.name / name for name in names)
     return Job(point.name, tuple(words), folders, base.folder / "logs" / f"{point.name}.log")

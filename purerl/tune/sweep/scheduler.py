@@ -17,10 +17,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import INTERRUPTED, SUCCESS, UserError
-from purerl.machine.files import make_folder, open_file, open_log, writing
-from purerl.machine.lock import FolderLock
+from purerl.machine import files, lock, signals
 from purerl.machine.output import printable, warn
-from purerl.machine.signals import handling
 from purerl.report import run_reader
 from purerl.runs import checkpoint_folder
 from purerl.runs.folder import CHECKPOINTS
@@ -76,7 +74,7 @@ def is_locked(job: Job) -> bool:
     for folder in job.folders:
         if folder.is_dir():
             try:
-                FolderLock(folder, patience=0.0).close()
+                lock.FolderLock(folder, patience=0.0).close()
             except UserError:
                 return True
             except OSError:  # the run itself will say what is wrong with it
@@ -104,7 +102,7 @@ def how_it_ended(job: Job) -> Ended:
 def _last_lines(log: Path) -> list[str]:
     """Returns the last lines of a log, from its last command on."""
     try:
-        with open_file(log) as file:
+        with files.open_file(log) as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
             text = file.read().decode(errors="replace")
     except OSError:
@@ -172,9 +170,9 @@ def start(job: Job, more: Mapping[str, str], before: tuple[str, ...] = ()) -> su
       before: words before the command, of a shell that prepares it.
     """
     words = [*RUN, *job.words, "--resume", "auto"]
-    with writing(job.log):
-        make_folder(job.log.parent)
-        log = open_log(job.log)
+    with files.writing(job.log):
+        files.make_folder(job.log.parent)
+        log = files.open_log(job.log)
         log.write(f"$ {shlex.join(['python', *words])}\n".encode())
     with log:
         # A session of its own: Ctrl-C in a terminal reaches this process alone, which passes it on.
@@ -187,7 +185,7 @@ def start(job: Job, more: Mapping[str, str], before: tuple[str, ...] = ()) -> su
 
 def end(job: Job, code: int) -> Ended:
     """Notes in a job's log, if it takes that, how its process ended; returns how the job ended."""
-    with contextlib.suppress(OSError), open_log(job.log) as log:
+    with contextlib.suppress(OSError), files.open_log(job.log) as log:
         log.write(f"[exit code {code}]\n".encode())
     return how_it_ended(job)
 
@@ -236,7 +234,7 @@ def carry_out(
                 _send(process, received[0])
             began(job)
 
-    with handling(PASSED_ON, pass_on):
+    with signals.handling(PASSED_ON, pass_on):
         try:
             more = True
             while active or (more and not received):

@@ -13,15 +13,13 @@ from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, UserError
 from purerl.experiment.loading import Source
 from purerl.experiment.settings_json import to_json
 from purerl.experiment.source_hashes import PACKAGE, source_hashes
-from purerl.machine.command_errors import check_installed
-from purerl.machine.files import check_object, make_folder, read_json, write_json, writing
+from purerl.machine import command_errors, files
 from purerl.machine.lock import FolderLock
 from purerl.machine.output import say, show, warn
 from purerl.runs import folder as run_folder, manifest
 from purerl.tune.sweep import points, scheduler, slurm, spaces, study, table
 from purerl.tune.sweep.options import SweepOptions, read as read_command
 from purerl.tune.sweep.points import Base, Point
-from purerl.tune.sweep.scheduler import Ended, Job
 from purerl.tune.sweep.spaces import Space
 
 
@@ -44,13 +42,13 @@ def execute(arguments: Sequence[str]) -> int:
     sweep = Sweep(options, base, swept, [])
     if options.optuna:
         spaces.check_number("optuna", options.optuna)
-        check_installed("optuna", "sweep")
+        command_errors.check_installed("optuna", "sweep")
     else:
         drawn = spaces.draw(swept, options.random) if options.random else spaces.grid(swept)
         sweep.points.extend(Point(number, values) for number, values in enumerate(drawn))
         points.check_all(base, sweep.points)
     if options.slurm:
-        check_installed("submitit", "sweep")
+        command_errors.check_installed("submitit", "sweep")
         slurm.check(options.slurm, base.folder)
     if options.dry_run:
         return _show_commands(sweep)
@@ -64,8 +62,7 @@ def _show_commands(sweep: Sweep) -> int:
         first = study.propose(study.open_study(None), sweep.spaces, sweep.options.optuna)
         shown = list(itertools.islice(first, study.FIRST))
     for point in shown:
-        job = points.job(sweep.base, point)
-        show(shlex.join(["python", "-m", "purerl.run", *job.words]))
+        show(shlex.join(["python", "-m", "purerl.run", *points.job(sweep.base, point).words]))
     if sweep.options.optuna > len(shown):
         show(f"# The other {sweep.options.optuna - len(shown)} points depend on scores.")
     return SUCCESS
@@ -79,8 +76,8 @@ def _begin(sweep: Sweep) -> Iterator[None]:
     """Makes the sweep's folder and locks it; UserError if it holds another sweep."""
     folder = sweep.base.folder
     file = folder / "sweep.json"
-    with writing(folder):
-        make_folder(folder)
+    with files.writing(folder):
+        files.make_folder(folder)
         run_folder.check_no_links(run_folder.read(folder))
         if not file.exists() and any(not one.name.startswith(".") for one in folder.iterdir()):
             raise UserError(f"{folder} holds no sweep, but other files; use another --name.")
@@ -90,10 +87,10 @@ def _begin(sweep: Sweep) -> Iterator[None]:
         described = _describe(sweep)
         if file.exists():
             # An older version wrote less down, and goes on.
-            begun = check_object(str(file), described | read_json(file), source=dict)
+            begun = files.check_object(str(file), described | files.read_json(file), source=dict)
             _check_same(folder, begun, described)
             _check_code(sweep.base, begun["source"], described["source"])
-        write_json(file, described)
+        files.write_json(file, described)
         yield
 
 
@@ -167,10 +164,10 @@ class _Progress:
         self.study = study.open_study(sweep.base.folder) if sweep.options.optuna else None
         known = study.known(self.study, sweep.spaces) if self.study else sweep.points
         self.points = {point.name: point for point in known}
-        self.results: list[Ended] = []
+        self.results: list[scheduler.Ended] = []
         self.begun: set[str] = set()  # by this command
 
-    def jobs(self) -> Iterator[Job]:
+    def jobs(self) -> Iterator[scheduler.Job]:
         """Yields what is to be run; Optuna chooses when it is asked for."""
         chosen: Iterator[Point] = iter(self.sweep.points)
         if self.study is not None:
@@ -179,11 +176,11 @@ class _Progress:
             self.points[point.name] = point
             yield points.job(self.sweep.base, point)
 
-    def began(self, job: Job) -> None:
+    def began(self, job: scheduler.Job) -> None:
         self.begun.add(job.name)
         say(f"{job.name}  begins   {self._values(job)}  (progress: {job.log})")
 
-    def ended(self, result: Ended) -> None:
+    def ended(self, result: scheduler.Ended) -> None:
         """Tells how a job ended; UserError if it is done, and no run so far has such a metric.
 
         That is told once of a point, so that the same command goes on; at the end in any case.
@@ -191,8 +188,7 @@ class _Progress:
         self.results.append(result)
         point, metric, score = self.points[result.job.name], self.sweep.options.metric, None
         if result.status == "done":
-            group = table.group_of(self.sweep.base, point)
-            score = table.summarize(group, metric)["score"]
+            score = table.summarize(table.group_of(self.sweep.base, point), metric)["score"]
             told_now = point.name in self.begun or len(self.results) == self.number
             if score is None and told_now:
                 table.check_metric(self.sweep.base, self.points.values(), metric)
@@ -203,7 +199,7 @@ class _Progress:
         count = f"{len(self.results)} of {self.number}"
         say(f"{point.name}  {result.status:8} {self._values(result.job)}{shown}  ({count})")
 
-    def _values(self, job: Job) -> str:
+    def _values(self, job: scheduler.Job) -> str:
         return " ".join(f"{n}={v}" for n, v in self.points[job.name].values.items())
 
 

@@ -4,7 +4,6 @@ import contextlib
 import sqlite3
 import warnings
 from collections.abc import Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +24,9 @@ def open_study(folder: Path | None) -> Any:
     storage = None
     if folder:
         # Connected to by path: in a URL, characters of a name are syntax.
-        connect = partial(sqlite3.connect, (folder / FILE).absolute(), check_same_thread=False)
-        storage = optuna.storages.RDBStorage("sqlite://", engine_kwargs={"creator": connect})
+        place = (folder / FILE).absolute()
+        how = {"creator": lambda: sqlite3.connect(place, check_same_thread=False)}
+        storage = optuna.storages.RDBStorage("sqlite://", engine_kwargs=how)
     return optuna.create_study(
         study_name="sweep", storage=storage, direction="maximize", load_if_exists=True
     )

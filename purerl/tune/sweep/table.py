@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from purerl.core.errors import UserError
-from purerl.machine.files import as_csv, write_file
-from purerl.machine.output import printable
+from purerl.machine import files, output
 from purerl.report import comparison, run_reader
 from purerl.report.seed_statistics import Group, check_scored, summarize
 from purerl.tune.sweep.points import Base, Point, job, typed_values
@@ -141,8 +140,8 @@ def write(
     sheet, text, drawn = (folder / f"sweep.{kind}" for kind in ("csv", "txt", "png"))
     names = ["point", *(space.setting for space in spaces)]
     names += ["n", "score", "low", "high", "mean", "worst", "status", "said"]
-    write_file(sheet, as_csv(names, map(as_record, rows)))
-    write_file(text, "".join(f"{printable(line)}\n" for line in lines).encode())
+    files.write_file(sheet, files.as_csv(names, map(as_record, rows)))
+    files.write_file(text, "".join(f"{output.printable(line)}\n" for line in lines).encode())
     return [sheet, text, *([drawn] if draw(drawn, rows, spaces, metric) else [])]
 
 
@@ -171,16 +170,14 @@ def draw(path: Path, rows: Sequence[Row], spaces: Sequence[Space], metric: str) 
     columns = min(COLUMNS, len(spaces))
     lines = -(-len(spaces) // columns)
     size = (4.5 * columns + 1, 3.6 * lines)
-    with comparison.picture(path, lines, columns, figsize=size, sharey=True, squeeze=False) as (
-        figure,
-        axes,
-    ):
+    drawn = comparison.picture(path, lines, columns, figsize=size, sharey=True, squeeze=False)
+    with drawn as (figure, axes):
         for panel, space in zip(axes.flat, spaces, strict=False):
             _draw_panel(panel, rows, space)
         for panel in axes.flat[len(spaces) :]:
             panel.set_axis_off()
         for panel in axes[:, 0]:
-            panel.set_ylabel(printable(metric))
+            panel.set_ylabel(output.printable(metric))
         legends = (panel.get_legend_handles_labels() for panel in axes.flat)
         handles = max(legends, key=lambda legend: len(legend[0]))
         figure.legend(*handles, loc="outside lower center", ncols=4, fontsize="small")
@@ -209,7 +206,7 @@ def _draw_panel(panel: Any, rows: Sequence[Row], space: Space) -> None:
         medians = [np.median([y for x, y in zip(place, scores, strict=True) if x == one])
                    for one in different]  # fmt: skip
         panel.plot(different, medians, color="C0", linewidth=1, label="median of the points")
-    panel.set_xlabel(printable(space.setting))
+    panel.set_xlabel(output.printable(space.setting))
     panel.grid(alpha=0.3)
     if numbers and has_log_axis(space, values):
         panel.set_xscale("log")
@@ -224,4 +221,4 @@ def _draw_panel(panel: Any, rows: Sequence[Row], space: Space) -> None:
 def _label(value: Any) -> str:
     if isinstance(value, tuple | list):
         return " ".join(map(_label, value))
-    return f"{value:.4g}" if isinstance(value, float) else printable(str(value))[:24]
+    return f"{value:.4g}" if isinstance(value, float) else output.printable(str(value))[:24]

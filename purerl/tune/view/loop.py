@@ -7,10 +7,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 from purerl.checks.user_code import program_errors
-from purerl.core.errors import UserError, one_line
+from purerl.core.errors import UserError, one_line, reason
 from purerl.tune.option_numbers import label
-from purerl.tune.view import session as events
-from purerl.tune.view.opening import Source
+from purerl.tune.view import opening, session as events
 from purerl.tune.view.session import Session, advance, to_build
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ def check_port(host: str, port: int) -> None:
     try:
         socket.create_server((host, port)).close()
     except (OSError, OverflowError) as error:
-        why = getattr(error, "strerror", None) or one_line(error)
+        why = reason(error)
         cure = "another --port (0 to 65535), or an address of this machine as --host"
         raise UserError(f"{host}:{port} cannot be listened on ({why}): give {cure}.") from error
 
@@ -68,7 +67,7 @@ def _told(function: Callable[..., Any], *arguments: Any) -> Any:
         return events.fail, one_line(error)
 
 
-def begin_work(session: Session, source: Source, beside: Beside) -> None:
+def begin_work(session: Session, source: opening.Source, beside: Beside) -> None:
     """Begins what the session waits for, unless something is being done."""
     if beside.work is not None:
         return
@@ -104,7 +103,7 @@ class Pace:
 
 
 def play(
-    page: "Page", session: Session, source: Source, say: Callable[[str], None],
+    page: "Page", session: Session, source: opening.Source, say: Callable[[str], None],
     stop: Callable[[], bool] = lambda: False,
 ) -> Session:  # fmt: skip
     """Plays a session until `stop()`, or Ctrl-C; returns it.

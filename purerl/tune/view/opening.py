@@ -15,12 +15,9 @@ from purerl.experiment import loading
 from purerl.experiment.definition import Experiment
 from purerl.experiment.objects import Setup, build
 from purerl.machine.output import show
-from purerl.runs import checkpoint_folder
-from purerl.runs.folder import CHECKPOINTS, CODE
-from purerl.runs.loaded_run import Run
-from purerl.runs.restored_run import read_checkpoint
-from purerl.tune import overrides
-from purerl.tune.option_numbers import replaced
+from purerl.runs import checkpoint_folder, loaded_run, restored_run
+from purerl.runs.folder import CHECKPOINTS, CODE, read_run
+from purerl.tune import option_numbers, overrides
 from purerl.tune.plan import planner
 from purerl.tune.subject import Subject
 from purerl.tune.view.drivers import Driver, planner_driver, policy_driver
@@ -61,14 +58,14 @@ def open_window(subject: Subject, chosen: Experiment, options: Any) -> tuple[Ses
     return _of_run(subject.run, chosen, options)
 
 
-def _of_run(run: Run, chosen: Experiment, options: Any) -> tuple[Session, Source, str]:
+def _of_run(run: loaded_run.Run, chosen: Experiment, options: Any) -> tuple[Session, Source, str]:
     setup, brain = run.restored.setup, jax.device_put(run.state)
     guide = functools.partial(planner.guide, setup.config, setup.network)
     planned = options.drive == "planner"
     driver = planner_driver(options, guide, brain) if planned else policy_driver(guide, brain)
 
     def other_brain(name: str) -> tuple[TrainState, str]:
-        saved = read_checkpoint(run.folder, name, setup, show)
+        saved = restored_run.read_checkpoint(read_run(run.folder), name, setup, show)
         return jax.device_put(saved.state), _words(saved.meta["update"], saved.meta["steps"])
 
     written = run.restored.source.experiment
@@ -109,13 +106,13 @@ def _source(
     observed = jax.eval_shape(setup.env.reset, jax.random.key(0)).observation
 
     def program(numbers: Numbers) -> Any:
-        changed = replaced(chosen.env, numbers)
+        changed = option_numbers.replaced(chosen.env, numbers)
         known = observed if jax.tree.leaves(brain) else None
         return build_program(chosen.build_env, changed, setup.engine, driver, brain, known)
 
     def told(numbers: Numbers, words: Callable[[Any], str]) -> str:
         try:
-            return words(replaced(chosen.env, numbers))
+            return words(option_numbers.replaced(chosen.env, numbers))
         except Exception as error:  # a rule of the options, until the sliders are taken back
             return one_line(error)
 
@@ -147,7 +144,7 @@ def checkpoint_names(folder: Path, first: str) -> list[str]:
     return list(dict.fromkeys([first, "latest", "best", *map(str, reversed(updates))]))
 
 
-def command_name(run: Run) -> str:
+def command_name(run: loaded_run.Run) -> str:
     """Returns what `python -m purerl.run` knows the run's experiment by."""
     name = run.restored.source.name
     if name in loading.available():

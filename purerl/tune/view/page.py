@@ -16,8 +16,7 @@ import viser
 from purerl.report.html_elements import Html
 from purerl.report.renderer import seen_by_eyes
 from purerl.tune.option_numbers import Place, bounds, label
-from purerl.tune.view import gate, readouts, session as events
-from purerl.tune.view.scene import Scene
+from purerl.tune.view import gate, readouts, scene, session as events
 from purerl.tune.view.session import Session
 
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
@@ -48,7 +47,7 @@ class Page:
         self.port = self.server.get_port()
         self.address = f"http://{host}:{self.port}/{key}/"
         self.server.gui.configure_theme(show_share_button=False, control_width="large")
-        self.scene = Scene(self.server, self.put)
+        self.scene = scene.Scene(self.server, self.put)
         self.sliders: dict[Place, Any] = {}
         self.numbers: dict[Place, Any] = {}  # as the sliders have told them
         self.plots: dict[str, Any] = {}

@@ -7,7 +7,6 @@ shape the model, or are compared with something while the environment is built; 
 takes a new program, which is built beside the old one.
 """
 
-import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -21,8 +20,7 @@ from purerl.core.keys import Purpose, derive
 from purerl.core.records import Array, PyTree
 from purerl.devices.compilation import jit, start as compile_beside
 from purerl.ppo.episodes import is_lost
-from purerl.report.episode_pictures import Picture, take_picture
-from purerl.report.renderer import model_of
+from purerl.report import episode_pictures, renderer
 from purerl.tune.option_numbers import Place, numbers_of, replaced
 from purerl.tune.view.drivers import Driver
 
@@ -41,7 +39,7 @@ class Moment(struct.PyTreeNode):
 class Shown(NamedTuple):
     """What a control step shows; numpy on the host."""
 
-    picture: Picture  # after the step
+    picture: episode_pictures.Picture  # after the step
     reward: Array  # []
     metrics: dict[str, Array]  # name -> []
     action: Array  # [A]
@@ -57,7 +55,7 @@ class Program(NamedTuple):
     env: Any
     live: dict[Place, int | float]  # numbers that are arguments: their first values
     fixed: dict[Place, int | float]  # numbers that it was built with
-    start: Callable[[Numbers, Array], tuple[Moment, Picture]]
+    start: Callable[[Numbers, Array], tuple[Moment, episode_pictures.Picture]]
     step: Callable[[Numbers, PyTree, Moment], tuple[Moment, Shown]]
 
 
@@ -105,17 +103,17 @@ def build_program(
             (lambda v, k: begin(built(v), driver, k), (values, key)),
             (lambda v, b, m: move(built(v), driver, b, m), (values, brain, first)),
         ]
-        compiled = [
-            compile_beside("init", jit("init", function).trace(*given))
-            for function, given in programs
-        ]
+        compiled = [compile_beside("init", jit("init", f).trace(*given)) for f, given in programs]
         start, step = (program.result()[0] for program in compiled)
     except (UserError, RunError):
         raise
     except Exception as error:  # of the environment's code: any
         raise UserError(one_line(error)) from error
     fixed = {place: value for place, value in every.items() if place not in live}
-    taken = functools.partial(_in_order, live)
+
+    def taken(numbers: Numbers) -> tuple:  # each of the type that it had
+        return tuple(type(first)(numbers[place]) for place, first in live.items())
+
     return Program(
         env, live, fixed,
         start=lambda numbers, key: _on_host(*start(taken(numbers), key)),
@@ -123,17 +121,12 @@ def build_program(
     )  # fmt: skip
 
 
-def _in_order(live: Numbers, numbers: Numbers) -> tuple:
-    """Returns the live numbers as a program takes them: each of the type that it had."""
-    return tuple(type(first)(numbers[place]) for place, first in live.items())
-
-
 def _on_host(moment: Moment, shown: Any) -> tuple[Moment, Any]:
     return moment, jax.device_get(shown)
 
 
 def _check(env: Any, observed: PyTree) -> None:
-    model_of(env)
+    renderer.model_of(env)
     given = jax.eval_shape(env.reset, jax.random.key(0)).observation
     given, wanted = (jax.tree.map(lambda x: list(x.shape), tree) for tree in (given, observed))
     if observed is not None and given != wanted:
@@ -165,11 +158,11 @@ def find_live(build: Callable[[Numbers], Any], numbers: Numbers) -> dict[Place, 
     return live if traces(live) else {}
 
 
-def begin(env: Any, driver: Driver, key: Array) -> tuple[Moment, Picture]:
+def begin(env: Any, driver: Driver, key: Array) -> tuple[Moment, episode_pictures.Picture]:
     """Starts an episode."""
     state = env.reset(jax.random.fold_in(key, 0))
     first = Moment(state, driver.start(env), key, jnp.zeros((), jnp.int32))
-    return first, take_picture(env, state)
+    return first, episode_pictures.take_picture(env, state)
 
 
 def move(env: Any, driver: Driver, brain: PyTree, moment: Moment) -> tuple[Moment, Shown]:
@@ -178,7 +171,7 @@ def move(env: Any, driver: Driver, brain: PyTree, moment: Moment) -> tuple[Momen
     action, value, memory = driver.act(env, brain, moment.env, moment.memory, key)
     state = env.step(moment.env, action)
     shown = Shown(
-        picture=take_picture(env, state),
+        picture=episode_pictures.take_picture(env, state),
         reward=state.reward,
         metrics=state.metrics,
         action=action,

@@ -51,8 +51,7 @@ def push(model: mujoco.MjModel, data: mujoco.MjData, body: int, point: Any, dv: 
 
 def pull(model: mujoco.MjModel, data: mujoco.MjData, grip: Grip, seconds: float) -> np.ndarray:
     """Returns the change of `qvel` [nv] as a damped spring to the pointer acts for `seconds`."""
-    rotation = data.xmat[grip.body].reshape(3, 3)
-    point = data.xpos[grip.body] + rotation @ grip.point
+    point = data.xpos[grip.body] + data.xmat[grip.body].reshape(3, 3) @ grip.point
     jacobian = np.zeros((3, model.nv))
     mujoco.mj_jac(model, data, jacobian, None, point, grip.body)
     rate = min(PULL_RATE, 0.5 / seconds)

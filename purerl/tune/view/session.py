@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from purerl.report.episode_pictures import Picture
-from purerl.report.renderer import root_body
+from purerl.report import episode_pictures, renderer
 from purerl.tune.option_numbers import Place
 from purerl.tune.view import push as pushes
 from purerl.tune.view.program import Moment, Program, Shown, episode_key
@@ -43,7 +42,7 @@ class Session(NamedTuple):
     # The episode.
     episode: int
     moment: Moment
-    picture: Picture
+    picture: episode_pictures.Picture
     rows: tuple[Row, ...] = ()  # the last SECONDS_KEPT
     sums: dict[str, float] = {}  # of the reward and of each metric, over the episode
     length: int = 0  # control steps
@@ -143,7 +142,7 @@ def slide(session: Session, place: Place, value: int | float) -> Session:
 def push(session: Session, dv: tuple[float, float, float]) -> Session:
     """Changes the velocity of the body's root by `dv` [m/s]."""
     model, data = session.program.env.physics.model, _place(session)
-    root = root_body(model)
+    root = renderer.root_body(model)
     return _with_velocity(session, pushes.push(model, data, root, data.subtree_com[root], dv))
 
 
@@ -188,8 +187,7 @@ def fail(session: Session, why: str) -> Session:
 
 def start_episode(session: Session, episode: int) -> Session:
     """Starts an episode of the session's seed."""
-    key = episode_key(session.seed, episode)
-    moment, picture = session.program.start(session.numbers, key)
+    moment, picture = session.program.start(session.numbers, episode_key(session.seed, episode))
     return session._replace(
         episode=episode, moment=moment, picture=picture, rows=(), sums={}, length=0, grip=None
     )

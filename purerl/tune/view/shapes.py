@@ -13,9 +13,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
 
-from purerl.report.episode_pictures import Picture
-from purerl.report.renderer import Stage
+from purerl.report import episode_pictures, renderer
 
 SPHERE, ROD, BOX = "sphere", "rod", "box"
 _GEOM = mujoco.mjtGeom
@@ -57,7 +57,7 @@ class Layout(NamedTuple):
     scales: np.ndarray  # [N, 3]
 
 
-def pose(stage: Stage, picture: Picture) -> None:
+def pose(stage: renderer.Stage, picture: episode_pictures.Picture) -> None:
     """Puts a stage's model into the place and form of a picture."""
     stage.put(picture)
     mujoco.mj_kinematics(stage.model, stage.data)
@@ -89,12 +89,12 @@ def layout(model: mujoco.MjModel, data: mujoco.MjData, batch: Batch) -> Layout:
     along = (batch.sides * size[:, 1])[:, None] * rotations[:, :, 2]
     return Layout(
         positions=np.asarray(data.geom_xpos[geoms] + along, np.float32),
-        wxyzs=np.asarray(_quaternions(rotations), np.float32),
+        wxyzs=Rotation.from_matrix(rotations).as_quat(scalar_first=True).astype(np.float32),
         scales=np.asarray(_scales(batch.shape, model.geom_type[geoms], size), np.float32),
     )
 
 
-def scenery_layout(picture: Picture) -> Layout | None:
+def scenery_layout(picture: episode_pictures.Picture) -> Layout | None:
     """Returns the boxes of an episode that are only drawn; None if there are none."""
     if not picture.scenery or not len(picture.scenery[0]):
         return None
@@ -148,14 +148,6 @@ def _scales(shape: str, kinds: np.ndarray, size: np.ndarray) -> np.ndarray:
     if shape == ROD:
         return np.concatenate([radius, radius, half], axis=1)
     return size if shape == BOX else np.ones_like(size)
-
-
-def _quaternions(rotations: np.ndarray) -> np.ndarray:
-    """Returns [N, 3, 3] rotations as quaternions [N, 4], w first."""
-    found = np.zeros((len(rotations), 4))
-    for quaternion, rotation in zip(found, rotations, strict=True):
-        mujoco.mju_mat2Quat(quaternion, rotation.ravel())
-    return found
 
 
 def _mesh(model: mujoco.MjModel, name: str) -> trimesh.Trimesh:

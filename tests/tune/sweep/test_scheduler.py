@@ -53,7 +53,7 @@ def test_a_log_that_the_disk_refuses_is_one_line(place, monkeypatch):
         scheduler.start(one, {})
     assert scheduler.end(one, 0).status == "stopped"
     assert scheduler.how_it_ended(one).said == ""  # a device has no end
-    monkeypatch.setattr(scheduler, "open_log", lambda _: open("/dev/full", "ab", 0))  # noqa: SIM115
+    monkeypatch.setattr(scheduler.files, "open_log", lambda _: open("/dev/full", "ab", 0))  # noqa: SIM115
     with pytest.raises(UserError, match=r"logs/a.log cannot be written: No space left on device"):
         scheduler.start(one, {})
     assert scheduler.end(one, 0).status == "stopped"

@@ -204,7 +204,7 @@ def test_a_name_is_no_reason(place, capsys):
 @pytest.mark.slow
 def test_two_processes_do_not_carry_out_one_sweep(place, capsys):
     assert start(*RATES) == SUCCESS
-    lock = scheduler.FolderLock(Path("sweeps/toy_experiment"))
+    lock = scheduler.lock.FolderLock(Path("sweeps/toy_experiment"))
     assert start(*RATES) == USAGE
     lock.close()
     assert "is being carried out by another process" in capsys.readouterr().err

@@ -1,6 +1,7 @@
-"""What an environment's functions hand to its physics, seen while they are traced."""
+"""Checks of an environment's physics: what it is told while it is traced; its units, its solver."""
 
 import contextlib
+import copy
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -15,6 +16,10 @@ from purerl.core.records import Array
 
 TINY = 1e-5  # of a range: what rounding may do
 FAR = 0.05  # [rad or m] from where a servo holds
+SOLVED = 0.01  # of what a control step moves: a solver that converged differs by rounding alone
+SMALL = np.radians(np.pi)  # a range that was probably written in radians, and read as degrees
+LARGE = 4 * np.pi  # one that was written in degrees, and read as radians
+SLIDE, NEWTON = 2, 2  # of mujoco.mjtJoint and mjtSolver
 
 
 class Seen(NamedTuple):
@@ -78,16 +83,14 @@ def _describe_controls(model: Any, given: np.ndarray) -> Finding:
     least, most = flat.min(0), flat.max(0)
     low, high = model.actuator_ctrlrange.T
     slack = TINY * np.maximum(high - low, 1.0)
-    beyond = model.actuator_ctrllimited.astype(bool) & (
-        (least < low - slack) | (most > high + slack)
-    )
+    over = model.actuator_ctrllimited.astype(bool) & ((least < low - slack) | (most > high + slack))
     names = lookup.names(model, "actuator")
-    if not beyond.any():
+    if not over.any():
         return ok("controls", f"of {model.nu} actuators, none beyond its ctrlrange")
-    i = int(np.argmax(beyond))
+    i = int(np.argmax(over))
     return warning(
         "controls",
-        f"{beyond.sum()} of {model.nu} actuators are driven beyond their ctrlrange, where MuJoCo "
+        f"{over.sum()} of {model.nu} actuators are driven beyond their ctrlrange, where MuJoCo "
         f"clamps: {names[i] or i} gets {least[i]:.3g} to {most[i]:.3g}, and has {low[i]:.3g} to "
         f"{high[i]:.3g}; map actions by lookup.scale_action.",
     )
@@ -136,7 +139,7 @@ def _named(names: tuple[str, ...], call: tuple) -> dict[str, Any]:
 
 def _find_zeros(physics: Any, begun: Begun) -> Iterator[Finding]:
     """Finds quaternions of zeros."""
-    from purerl.physics.as_built import ZERO_ROTATION, has_zero_rotation
+    from purerl.physics.changes import ZERO_ROTATION, has_zero_rotation
 
     changes = begun.given.get("changes") or {}
     for i, qpos in enumerate(begun.given["qpos"]):
@@ -200,9 +203,8 @@ def check_changes(physics: Any, begun: Begun) -> Iterator[Finding]:
             except ValueError as wrong:
                 yield error("changes", f"of {call}: {wrong}")
                 return
-    differ: dict[str, set[str]] = {call: set() for call in found}
-    for call, changes in found.items():
-        for name, value in changes.items():
+    for call, other in (("init", "step"), ("step", "init")):
+        for name, value in found[call].items():
             rows = (value != np.float32(getattr(own, name))).any(0)
             rows = rows.reshape(len(rows), -1).any(1)
             if name in ("body_pos", "body_quat"):
@@ -210,10 +212,66 @@ def check_changes(physics: Any, begun: Begun) -> Iterator[Finding]:
             if (rows & idle_rows(own, physics.engine, name)).any():
                 what = f"changes[{name!r}] differs from the model in rows that nothing heeds"
                 yield warning("changes", f"{what}: {np.flatnonzero(rows)[:6].tolist()}.")
-            differ[call] |= {name} if rows.any() else set()
-    for call, other in (("init", "step"), ("step", "init")):
-        for name in differ[call] - set(found[other]):
-            what = (
-                f"changes[{name!r}] is given to {call} and not to {other}, which takes the model's"
-            )
-            yield warning("changes", f"{what} own: give each call all of them.")
+            if rows.any() and name not in found[other]:
+                what = f"changes[{name!r}] is given to {call} and not to {other}"
+                cure = "which takes the model's own: give each call all of them."
+                yield warning("changes", f"{what}, {cure}")
+
+
+def check_model(env: Env, trial: Trial) -> Iterator[Finding]:
+    """Yields what is found of the model of `env.physics`; nothing where there is none."""
+    physics: Any = getattr(env, "physics", None)
+    if hasattr(physics, "substeps"):
+        yield from check_ranges(physics.model)
+        yield from check_solver(env, physics, trial)
+
+
+def check_ranges(model: Any) -> Iterator[Finding]:
+    """Warns of joints' ranges of angles that look like degrees read as radians, or the reverse."""
+    from purerl.physics import lookup
+
+    turns = np.abs(model.jnt_range).max(1, initial=0.0) * model.jnt_limited  # [njnt] [rad]
+    turns[model.jnt_type == SLIDE] = 0.0
+    small = (turns > 0) & (turns < SMALL)
+    small &= 2 * small.sum() > (turns > 0).sum()  # a file has one unit; a few joints may be stiff
+    for unit, odd in (("radians", small), ("degrees", turns > LARGE)):
+        for i in np.flatnonzero(odd)[:1]:
+            name = lookup.names(model, "joint")[i] or i
+            what = f"joint {name} turns by {turns[i]:.3g} rad at most"
+            cure = f'were they written in {unit}? See <compiler angle="..."/>'
+            yield warning("ranges", f"{what}, and {odd.sum()} ranges look like that: {cure}.")
+
+
+def check_solver(env: Env, physics: Any, trial: Trial) -> Iterator[Finding]:
+    """Compares control steps with those of a solver of many more iterations, both of MuJoCo's C."""
+    from purerl.physics.interface import Physics
+
+    def given(state: State, action: Array) -> tuple[Any, Any]:
+        with watching(physics) as seen:
+            env.step(state, action)
+        return seen.calls[0]
+
+    def after(model: Any) -> np.ndarray:
+        step = Physics(model, (), physics.substeps, "c").step
+        batch = jax.vmap(jax.vmap(lambda call: step(*call[0], **call[1])[0].qpos))
+        return np.asarray(jax.jit(batch)(calls))
+
+    solved, opt = copy.copy(physics.model), physics.model.opt
+    solved.opt.solver, solved.opt.iterations, solved.opt.ls_iterations = NEWTON, 1000, 500
+    try:
+        states = jax.tree.map(lambda x, y: jnp.r_[x[None], y[:-1]], trial.start, trial.states)
+        calls = jax.jit(jax.vmap(jax.vmap(given)))(states, trial.actions)
+        old, own, best = np.asarray(calls[0][0].qpos), after(physics.model), after(solved)
+    except Exception:  # a trace of the user's own around the physics
+        return
+    good = np.isfinite(old + best).all(-1)
+    if not good.any():
+        return
+    gap, moved = (np.abs(x - best)[good].max() for x in (own, old))
+    what = f"{opt.iterations} iterations ({opt.ls_iterations} of line search)"
+    said = f"after one control step qpos is up to {gap:.2g} from a converged solver's, by {what}"
+    mend = "raise them" + ", or take Newton" * (opt.solver != NEWTON)
+    if gap <= SOLVED * moved:
+        yield ok("solver", said)
+    else:
+        yield warning("solver", f"{said}; it moves by {moved:.2g}: {mend}.")
