@@ -212,7 +212,7 @@ def check_pictures(trial: check_env.Trial) -> Iterator[Finding]:
             elif not (moves := np.ptp(one, axis=0).any(0)).any():
                 yield warning("eyes", f"{what}: nothing moves in it, whatever the body does.")
             else:
-                said = f"contrast {one.std():.2f} (white is 1), {moves.mean():.0%} of its pixels move"
+                said = f"contrast {one.std():.2f} (white is 1), {moves.mean():.0%} of pixels move"
                 yield ok("eyes", f"{what}: {said}")
 
 

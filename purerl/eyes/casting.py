@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from purerl.core.records import Array
@@ -24,6 +25,9 @@ Boxes = tuple[Array, Array]  # centers and half sizes, [P, 3] each [m]
 class Seen(NamedTuple):
     """Shapes as one eye has them before it."""
 
+    kind: np.ndarray  # [S] index in KINDS, ascending
+    eye: Array  # [3] where it is [m]
+    axes: Array  # [3, 3] its axes
     turn: Array  # [S, 3, 3] from the eye's frame into the shape's own, scaled
     origin: Array  # [S, 3] of the eye, there
     light: Array  # [S, 3] where light comes from, in the shape's own frame, not scaled
@@ -57,7 +61,11 @@ def before_eye(
     place = both(xpos[shapes.body] + turned(turn, shapes.position), boxes[0])
     own = jnp.swapaxes(both(product(turn, shapes.axes), jnp.eye(3)), 1, 2)
     scale = both(shapes.scale, boxes[1])
+    box = list(KINDS).index(mujoco.mjtGeom.mjGEOM_BOX)
     return Seen(
+        kind=np.append(shapes.kind, np.full(len(boxes[0]), box)),
+        eye=position,
+        axes=axes,
         turn=product(own, axes) / scale[:, :, None],
         origin=turned(own, position - place) / scale,
         light=turned(own, LIGHT),
@@ -80,20 +88,18 @@ def in_view(seen: Seen, rays: np.ndarray, reach: float) -> Array:
     return visible
 
 
-def nearest(seen: Seen, visible: Array, kinds: np.ndarray, rays: np.ndarray) -> tuple[Array, Array]:
+def nearest(seen: Seen, visible: Array, rays: np.ndarray) -> tuple[Array, Array]:
     """Returns where each ray enters its first shape, [N] in lengths of the ray, and which that is.
 
     Args:
       seen: S shapes.
       visible: [S] bool: which to try.
-      kinds: [S] indices in KINDS, ascending.
       rays: [2, N].
     """
-    number = rays.shape[1]
-    found = jnp.full(number, jnp.inf, jnp.float32), jnp.zeros(number, jnp.int32)
+    found = jnp.full_like(rays[0], jnp.inf), jnp.zeros_like(rays[0], jnp.int32)
     for k, kind in enumerate(KINDS.values()):
-        if k in kinds:
-            found = _nearest_of(kind, visible & (kinds == k), seen, rays, found)
+        if k in seen.kind:
+            found = _nearest_of(kind, visible & (seen.kind == k), seen, rays, found)
     return found
 
 
@@ -113,24 +119,20 @@ def _nearest_of(
     return jax.lax.while_loop(lambda carry: carry[0].any(), try_one, (todo, *found))[1:]
 
 
-def lit(
-    t: Array, which: Array, seen: Seen, kinds: np.ndarray, rays: np.ndarray
-) -> tuple[Array, Array]:
+def lit(t: Array, which: Array, seen: Seen, rays: np.ndarray) -> tuple[Array, Array]:
     """Returns how directly light falls where each ray enters, and the ray itself, [N] 0 to 1 each.
 
     Args:
       t: [N] of the entries.
       which: [N] the shapes.
       seen: S shapes.
-      kinds: [S] indices in KINDS.
       rays: [2, N].
     """
-    scale, length, kind = seen.scale[which], seen.length[which], jnp.asarray(kinds)[which]
+    scale, length, kind = seen.scale[which], seen.length[which], jnp.asarray(seen.kind)[which]
     ray = jnp.stack(along(seen.turn[which], rays), axis=1)
-    point = seen.origin[which] + t[:, None] * ray
-    normal = point
+    normal = point = seen.origin[which] + t[:, None] * ray
     for k, one in enumerate(KINDS.values()):
-        if k in kinds:
+        if k in seen.kind:
             normal = jnp.where((kind == k)[:, None], one.normal(point, length), normal)
     normal, ray = _unit(normal / scale), _unit(ray * scale)  # no longer scaled
     light = jnp.maximum((normal * seen.light[which]).sum(-1), 0.0)

@@ -11,20 +11,9 @@ import mujoco
 import numpy as np
 
 from purerl.core.records import Array
-from purerl.eyes.casting import (
-    Boxes,
-    Seen,
-    along,
-    before_eye,
-    in_view,
-    lit,
-    nearest,
-    product,
-    turned,
-)
+from purerl.eyes import casting
 from purerl.eyes.eye import Eye, rays
 from purerl.eyes.scene import shapes_of
-from purerl.eyes.shapes import KINDS
 from purerl.physics import lookup
 
 SHADE = 0.4  # of the light, what a surface turned away from it still has
@@ -70,7 +59,7 @@ class Eyes:
         self.stretch = np.sqrt(1.0 + np.square(self.rays).sum(0))  # a ray's length, 1 m ahead
         self.shapes = shapes_of(model, hide)
 
-    def see(self, xpos: Array, xmat: Array, boxes: Boxes | None = None) -> Array:
+    def see(self, xpos: Array, xmat: Array, boxes: casting.Boxes | None = None) -> Array:
         """Returns grey pictures, [E, H, W] uint8, upper row first.
 
         Args:
@@ -80,42 +69,36 @@ class Eyes:
         """
         return self._each(self._picture, xpos, xmat, boxes)
 
-    def distance(self, xpos: Array, xmat: Array, boxes: Boxes | None = None) -> Array:
+    def distance(self, xpos: Array, xmat: Array, boxes: casting.Boxes | None = None) -> Array:
         """Returns how far what is seen is along each ray, [E, H, W] [m]; inf: nothing there."""
         return self._each(lambda t, *_: t * self.stretch, xpos, xmat, boxes)
 
     def _each(
-        self, answer: Callable[..., Array], xpos: Array, xmat: Array, boxes: Boxes | None
+        self, answer: Callable[..., Array], xpos: Array, xmat: Array, boxes: casting.Boxes | None
     ) -> Array:
         """Returns what `answer` makes of each eye's entries, [E, H, W]."""
         boxes = boxes or (jnp.zeros((0, 3)), jnp.zeros((0, 3)))
-        of_boxes = np.full(len(boxes[0]), list(KINDS).index(mujoco.mjtGeom.mjGEOM_BOX))
-        kinds = np.concatenate([self.shapes.kind, of_boxes])
         turn = xmat[self.body]
 
         def one(position: Array, axes: Array) -> Array:
-            seen = before_eye(self.shapes, xpos, xmat, boxes, position, axes)
-            t, which = nearest(seen, in_view(seen, self.rays, self.reach), kinds, self.rays)
+            seen = casting.before_eye(self.shapes, xpos, xmat, boxes, position, axes)
+            visible = casting.in_view(seen, self.rays, self.reach)
+            t, which = casting.nearest(seen, visible, self.rays)
             t = jnp.where(t * self.stretch <= self.reach, t, jnp.inf)
-            return answer(t, which, seen, kinds, position, axes).reshape(self.size)
+            return answer(t, which, seen).reshape(self.size)
 
-        position = xpos[self.body] + turned(turn, self.position)
-        return jax.vmap(one)(position, product(turn, self.axes))
+        position = xpos[self.body] + casting.turned(turn, self.position)
+        return jax.vmap(one)(position, casting.product(turn, self.axes))
 
-    def _picture(
-        self, t: Array, which: Array, seen: Seen, kinds: np.ndarray, position: Array, axes: Array
-    ) -> Array:
+    def _picture(self, t: Array, which: Array, seen: casting.Seen) -> Array:
         """Returns the grey of each pixel, [N] uint8."""
         there = jnp.isfinite(t)
         t = jnp.where(there, t, 0.0)
-        light, facing = lit(t, which, seen, kinds, self.rays)
-        ray = along(axes, self.rays)
+        light, facing = casting.lit(t, which, seen, self.rays)
+        ray = jnp.stack(casting.along(seen.axes, self.rays))
         # Checks are of a place a little behind the surface. On a floor, z is 0 or 1e-7 below.
-        inside = t + 0.1 * self.check
-        cells = [
-            jnp.floor((p + inside * x) / self.check) for p, x in zip(position, ray, strict=True)
-        ]
-        odd = (cells[0] + cells[1] + cells[2]) % 2.0
+        place = seen.eye[:, None] + (t + 0.1 * self.check) * ray
+        odd = jnp.floor(place / self.check).sum(0) % 2.0
         # Checks smaller than two pixels fade into their mean, or they would be noise.
         pixel = 2.0 * np.abs(self.rays[1]).max() / self.size[0] * t
         fade = jnp.clip((self.check * facing / pixel - 0.5) / 1.5, 0.0, 1.0)

@@ -38,26 +38,26 @@ def shapes_of(model: mujoco.MjModel, hide: Sequence[str] = ()) -> Shapes:
                 f"Eyes do not see a {kind}, and geom {model.geom(i).name or int(i)!r} is one: name "
                 "it or its body in `hide`, or put a simpler geom in its place."
             )
+    seen = np.array(sorted(seen, key=lambda i: order[model.geom_type[i]]), int)
     kind = np.array([order[model.geom_type[i]] for i in seen], int)
-    seen = seen[np.argsort(kind, kind="stable")]
-    kind.sort()
-    sizes = zip(kind, model.geom_size[seen], strict=True)
-    scale = np.array([kinds[k].scale(size) for k, size in sizes]).reshape(-1, 3)
-    radius = np.where(model.geom_rbound[seen] > 0.0, model.geom_rbound[seen], np.inf)  # 0: a plane
+    scale = np.array([kinds[kind[n]].scale(model.geom_size[i]) for n, i in enumerate(seen)])
+    scale, radius = scale.reshape(-1, 3), model.geom_rbound[seen]
     numbers = (
         model.geom_pos[seen],
         np.array([rotation(quat) for quat in model.geom_quat[seen]]).reshape(-1, 3, 3),
         scale,
         model.geom_size[seen, 1] / scale[:, 0],
-        radius,
+        np.where(radius > 0.0, radius, np.inf),  # a plane has none
         np.array([_grey(model, int(i)) for i in seen]),
     )
     return Shapes(model.geom_bodyid[seen], kind, *(x.astype(np.float32) for x in numbers))
 
 
 def _hidden(model: mujoco.MjModel, hide: Sequence[str]) -> np.ndarray:
-    """Tells which geoms are not seen, [ngeom] bool: named, on a named body, clear, of a group
-    from 3 on, which MuJoCo does not draw."""
+    """Tells which geoms are not seen, [ngeom] bool: named, on a named body, clear, or of group 3.
+
+    MuJoCo draws none of groups 3 to 5 either.
+    """
     bodies, geoms = lookup.names(model, "body"), lookup.names(model, "geom")
     for name in hide:
         if name not in bodies + geoms:

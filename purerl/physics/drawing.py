@@ -101,24 +101,6 @@ class Stage:
         return float(np.max(away + self.model.geom_rbound[own], initial=least))
 
 
-def seen_by_eyes(picture: Picture, width: int) -> np.ndarray:
-    """Returns what the eyes see side by side, [height, at most `width`, 3] uint8, or more if they
-    have more pixels, each of which becomes a square."""
-    seen = np.concatenate(np.asarray(picture.eyes[0]), axis=1)
-    edge = max(1, width // seen.shape[1])
-    return seen.repeat(edge, 0).repeat(edge, 1)[:, :, None].repeat(3, 2)
-
-
-def add_eyes(frame: np.ndarray, picture: Picture) -> np.ndarray:
-    """Returns a frame [height, width, 3] with what the eyes see in its upper right corner."""
-    if not picture.eyes:
-        return frame
-    height, width, _ = frame.shape
-    seen, frame = seen_by_eyes(picture, width // 3)[:height, :width], frame.copy()
-    frame[: seen.shape[0], -seen.shape[1] :] = seen
-    return frame
-
-
 def add_scenery(scene: mujoco.MjvScene, scenery: tuple[Array, ...]) -> None:
     """Adds a picture's boxes to a scene that MuJoCo has updated."""
     for center, half_size in zip(*scenery, strict=True) if scenery else ():

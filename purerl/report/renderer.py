@@ -9,15 +9,8 @@ import numpy as np
 
 from purerl.core.errors import UserError
 
-# The last two are for rooms that may not import physics.
-from purerl.physics.drawing import (  # noqa: F401
-    Picture,
-    Stage,
-    add_eyes,
-    add_scenery,
-    root_body,
-    seen_by_eyes,
-)
+# The last one is for rooms that may not import physics.
+from purerl.physics.drawing import Picture, Stage, add_scenery, root_body  # noqa: F401
 from purerl.report.opengl import open_gl
 
 
@@ -75,3 +68,23 @@ class Renderer(contextlib.AbstractContextManager):
         frame = np.empty((self.size.height, self.size.width, 3), np.uint8)
         mujoco.mjr_readPixels(frame, None, self.size, self.context)
         return add_eyes(frame[::-1], picture)  # OpenGL counts rows from below
+
+
+def seen_by_eyes(picture: Picture, width: int) -> np.ndarray:
+    """Returns what the eyes see side by side, each pixel a square, [height, width, 3] uint8.
+
+    The width is at most as asked for, or one for each of their pixels.
+    """
+    seen = np.concatenate(np.asarray(picture.eyes[0]), axis=1)
+    edge = max(1, width // seen.shape[1])
+    return seen.repeat(edge, 0).repeat(edge, 1)[:, :, None].repeat(3, 2)
+
+
+def add_eyes(frame: np.ndarray, picture: Picture) -> np.ndarray:
+    """Returns a frame [height, width, 3] with what the eyes see in its upper right corner."""
+    if not picture.eyes:
+        return frame
+    height, width, _ = frame.shape
+    seen, frame = seen_by_eyes(picture, width // 3)[:height, :width], frame.copy()
+    frame[: seen.shape[0], -seen.shape[1] :] = seen
+    return frame

@@ -496,4 +496,4 @@ def test_eyes_that_see_nothing_or_nothing_that_moves_are_told():
     assert len(said) == 3
     assert "eye 0 of observation/eyes is the same grey, 0.9, everywhere" in said[0]
     assert "eye 1 of observation/eyes: nothing moves in it" in said[1]
-    assert "100% of its pixels move" in said[2]
+    assert "100% of pixels move" in said[2]

@@ -197,8 +197,7 @@ class Page:
         if self.eyes is None:
             with self.tab:
                 self.eyes = self.server.gui.add_image(seen, label="Eyes")
-        else:
-            self.eyes.image = seen
+        self.eyes.image = seen
 
     def _draw_plots(self, session: Session) -> None:
         """Draws the lines; with fewer than two points uPlot has no scale, and they stay."""
