@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+import purerl.eyes.casting as casting  # by its name: the room imports this module
 from purerl.core.records import Array
-from purerl.eyes import casting
 from purerl.eyes.eye import Eye, rays
 from purerl.eyes.scene import shapes_of
 from purerl.physics import lookup
