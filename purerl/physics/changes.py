@@ -168,8 +168,7 @@ def idle_rows(model: mujoco.MjModel, engine: str, name: str) -> np.ndarray:
     """Tells which rows of a field, [n] bool, an engine never heeds."""
     value = getattr(model, name)
     all_idle = name in LEFT_OUT[engine] or (name == "body_gravcomp" and not value.any())
-    partly = "_frictionloss", "tendon_armature"
-    all_idle |= engine == "jax" and name.endswith(partly) and not value.all()
+    all_idle |= engine == "jax" and name.endswith(("loss", "tendon_armature")) and not value.all()
     idle = np.full(len(value), all_idle)
     for end, other in _SWITCHES.items():
         switch = re.sub(end, other, name)

@@ -138,19 +138,15 @@ def _load(targets: list[np.ndarray], rows: np.ndarray, bad: np.ndarray, model) -
     position instead, and its result is thrown away.
     """
     if bad.any():
-        rows = rows.copy()
-        rows[bad] = 0.0
-        rows[bad, : model.nq] = model.qpos0
+        rest = np.append(model.qpos0, np.zeros(rows.shape[1] - model.nq))
+        rows = np.where(bad[:, None], rest, rows)
     host_calls.unpack(targets, rows)
 
 
 def _advance(batch: Batch, stage: int, substeps: int) -> np.ndarray:
     """Steps all simulations; returns which of them blew up, [N] bool."""
     with contextlib.suppress(SimulationError):  # `status` says which; the others ran on
-        if substeps:
-            batch.step(nstep=substeps, stage=stage)
-        else:
-            batch.forward()
+        batch.step(nstep=substeps, stage=stage) if substeps else batch.forward()
     for i, kind in np.argwhere(batch.warning[..., 1]):
         reasons.note(mujoco.mju_warningText(int(kind), int(batch.warning[i, kind, 0])))
     for i in np.flatnonzero(batch.status):

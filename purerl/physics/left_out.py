@@ -46,7 +46,7 @@ def _combinations(model: mujoco.MjModel) -> dict[str, dict[str, bool]]:
     damped = model.dof_damping.any() and integrator == "EULER"
     pairs = model.body_weldid[model.geom_bodyid[np.array([model.pair_geom1, model.pair_geom2])]]
     dense = not mujoco.mj_isSparse(model)
-    late = model.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC
+    late = (model.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC) & (integrator == "RK4")
     either = {"a rangefinder on a camera, or with other data than dist": (rays & ~plain).any()}
     jax = {
         "a rangefinder, and a cylinder or height field": rays.any() and unseen.any(),
@@ -60,8 +60,7 @@ def _combinations(model: mujoco.MjModel) -> dict[str, dict[str, bool]]:
         "dampers disabled, and eulerdamp not": damped and dampers and not explicit,
     }
     warp = {
-        "sensors of accelerations under RK4, at its first stage": integrator == "RK4"
-        and late.any(),
+        "sensors of accelerations under RK4, at its first stage": late.any(),
         'gaintype="user"': (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_USER).any(),
     }
     return {"c": {}, "jax": either | jax, "warp": either | warp}
