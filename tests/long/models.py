@@ -78,7 +78,7 @@ def plain(model: mujoco.MjModel, state: Any, ctrl: np.ndarray, substeps: int) ->
     except mujoco.FatalError:
         return None
     late = late if substeps else data
-    if max(np.abs(late.qpos).max(initial=0), np.abs(late.qvel).max(initial=0)) > mujoco.mjMAXVAL:
+    if not max(np.abs(x).max(initial=0) for x in (late.qpos, late.qvel)) <= mujoco.mjMAXVAL:
         return None  # which the next step would find
     if any(late.warning[int(kind)].number for kind in LOST):
         return None
