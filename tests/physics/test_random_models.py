@@ -5,7 +5,7 @@ import collections
 import mujoco
 import pytest
 
-from purerl.physics import constants, engine_c
+from purerl.physics import changes, engine_c
 from tests.long import models
 
 pytestmark = pytest.mark.slow
@@ -30,7 +30,7 @@ def test_engine_jax_is_mujoco():
     tried("jax", 1, first=1)
 
 
-def forget_constants(model, changes, wanted):
+def forget_constants(model, _, wanted):
     return {n: getattr(model, n) for n in wanted}
 
 
@@ -43,7 +43,7 @@ def late_forgotten(batch, stage, substeps, advance=engine_c._advance):
     [
         (engine_c, "_movable", lambda model, names: model),
         (engine_c, "_advance", late_forgotten),
-        (constants, "derive", forget_constants),
+        (changes, "derive", forget_constants),
     ],
 )
 def test_a_broken_engine_is_noticed(monkeypatch, module, name, broken):
