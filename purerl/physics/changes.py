@@ -109,7 +109,7 @@ def check_fields(model: mujoco.MjModel, engine: str, changes: dict[str, Any]) ->
             raise ValueError(
                 f"changes[{name!r}] would do nothing on engine {engine!r}: it is heeded only where "
                 "the model was compiled with such a limit, with an actuator of that kind, or with "
-                f"{name} above 0 (frictionloss on 'jax': everywhere)."
+                f"{name} above 0 (frictionloss, tendon_armature on 'jax': everywhere)."
             )
 
 
@@ -168,7 +168,7 @@ def idle_rows(model: mujoco.MjModel, engine: str, name: str) -> np.ndarray:
     """Tells which rows of a field, [n] bool, an engine never heeds."""
     value = getattr(model, name)
     all_idle = name in LEFT_OUT[engine] or (name == "body_gravcomp" and not value.any())
-    all_idle |= engine == "jax" and name.endswith("_frictionloss") and not value.all()
+    all_idle |= engine == "jax" and name.endswith(("loss", "tendon_armature")) and not value.all()
     idle = np.full(len(value), all_idle)
     for end, other in _SWITCHES.items():
         switch = re.sub(end, other, name)
@@ -178,11 +178,19 @@ def idle_rows(model: mujoco.MjModel, engine: str, name: str) -> np.ndarray:
 
 
 def _set_constants(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, np.ndarray]:
-    """Sets a model's constants; returns those that are heeded: a camera's only where it tracks."""
+    """Sets a model's constants; returns those that are heeded: a camera's only where it tracks.
+
+    A tendon's have the geoms with them that it may bend round, if those move far enough; what it
+    weighs at its ends then has its length, too.
+    """
     mujoco.mj_setConst(model, data)
-    modes = {"cam": model.cam_mode, "light": model.light_mode}
-    tracks = {kind: np.isin(mode, _TRACKING) for kind, mode in modes.items()}
-    return {n: getattr(model, n)[tracks.get(n.split("_")[0], ...)].copy() for n in CONSTANTS}
+    tracks = {n: np.isin(getattr(model, f"{n}_mode"), _TRACKING) for n in ("cam", "light")}
+    found = {n: getattr(model, n)[tracks.get(n.split("_")[0], ...)].copy() for n in CONSTANTS}
+    round_ = model.wrap_objid[model.wrap_type >= int(mujoco.mjtWrap.mjWRAP_SPHERE)]
+    bend = [x[round_].ravel() for x in (data.geom_xpos, data.geom_xmat, model.geom_size)]
+    found["tendon_length0"] = np.concatenate([found["tendon_length0"], *bend])
+    found["tendon_invweight0"] = np.append(found["tendon_invweight0"], found["tendon_length0"])
+    return found
 
 
 def _refusals(
@@ -196,6 +204,8 @@ def _refusals(
             "would not change the inertia of a body that was compiled as a simple one (it is free, "
             'or slides): write simple="false" into its <body>.',
         )
+    if name == "geom_size":
+        yield model.geom_fluid[:, 0] > 0, "would be unknown to a fluid: remove its fluidshape."
     behind = {n: rows for n, rows in follows(name).items() if n not in changes}
     if behind:
         hand = " and ".join(n for n in behind if n in _COMPILED)

@@ -5,6 +5,7 @@ saves the row, and its results do not depend on the number of threads: it is a p
 arguments, which is what `jax.pure_callback` and `host_calls` ask for.
 """
 
+import contextlib
 import copy
 import functools
 import threading
@@ -36,8 +37,10 @@ class CEngine:
           stage: `mujoco.mjtStage` to compute at the new state, the least that the readings need.
           substeps: physics steps in one control step.
         """
-        # A copy, since programs know the engine by its name.
+        # A copy, since programs know the engine by its name. With the bit `energy` a sensor of
+        # energy would read that of another simulation of the batch; without, it computes its own.
         self.model, self.record = copy.copy(model), record
+        self.model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
         self.stage, self.substeps = stage, substeps
         # All that results depend on, but what is asked of a call.
         self.name = f"purerl-{lookup.hash_model(self.model, (*record._fields, stage))}"
@@ -92,13 +95,15 @@ def _movable(model: mujoco.MjModel, names: tuple[str, ...]) -> mujoco.MjModel:
 
     The compiler marks geoms and sites that coincide with their body (`geom_sameframe`), and MuJoCo
     then never reads their own frame, which would make a change of it do nothing. It also bounds the
-    geoms of a body by volumes of its own, and finds no contact outside of those (midphase).
+    geoms of a body by volumes of its own, and finds no contact outside of those (midphase)
+    and no hit of a camera's rays.
     """
-    if not any(n.endswith(("_pos", "_quat", "_size", "_margin", "_gap")) for n in names):
+    if not any(n.endswith(("pos", "quat", "_size", "_margin", "_gap")) for n in names):
         return model
     model = copy.copy(model)
     model.geom_sameframe[:] = model.site_sameframe[:] = model.body_sameframe[:] = 0
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
+    model.bvh_aabb[: model.body_bvhnum.sum(), 3:] = mujoco.mjMAXVAL
     return model
 
 
@@ -110,8 +115,7 @@ def _run_rows(
     `fields` of the state and changed `names` of the model are in the order of a row. 0 substeps
     compute the readings at the state as it is. A simulation that blew up is all NaN.
     """
-    rows = np.asarray(rows)
-    flat = rows.reshape(-1, rows.shape[-1])
+    flat = np.asarray(rows).reshape(-1, np.shape(rows)[-1])
     with engine.lock:
         batch, targets, sources, full = engine.rows_of(len(flat), fields, names)
         bad = ~np.isfinite(flat).all(axis=1)
@@ -124,7 +128,7 @@ def _run_rows(
         read = [source.reshape(len(flat), source[0].size) for source in sources]
         out = np.concatenate(read, axis=1, dtype=np.float32)
     out[bad] = np.nan
-    return out.reshape(*rows.shape[:-1], out.shape[-1])
+    return out.reshape(*np.shape(rows)[:-1], out.shape[-1])
 
 
 def _load(targets: list[np.ndarray], rows: np.ndarray, bad: np.ndarray, model) -> None:
@@ -134,21 +138,15 @@ def _load(targets: list[np.ndarray], rows: np.ndarray, bad: np.ndarray, model) -
     position instead, and its result is thrown away.
     """
     if bad.any():
-        rows = rows.copy()
-        rows[bad] = 0.0
-        rows[bad, : model.nq] = model.qpos0
+        rest = np.append(model.qpos0, np.zeros(rows.shape[1] - model.nq))
+        rows = np.where(bad[:, None], rest, rows)
     host_calls.unpack(targets, rows)
 
 
 def _advance(batch: Batch, stage: int, substeps: int) -> np.ndarray:
     """Steps all simulations; returns which of them blew up, [N] bool."""
-    try:
-        if substeps:
-            batch.step(nstep=substeps, stage=stage)
-        else:
-            batch.forward()
-    except SimulationError:
-        pass  # `status` says which; the others ran to completion
+    with contextlib.suppress(SimulationError):  # `status` says which; the others ran on
+        batch.step(nstep=substeps, stage=stage) if substeps else batch.forward()
     for i, kind in np.argwhere(batch.warning[..., 1]):
         reasons.note(mujoco.mju_warningText(int(kind), int(batch.warning[i, kind, 0])))
     for i in np.flatnonzero(batch.status):

@@ -15,7 +15,7 @@ from purerl.physics.lookup import reading_shapes
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that warp, which is optional, is absent
     from mujoco import mjx
-    from mujoco.mjx._src import forward, sensor, smooth
+    from mujoco.mjx._src import forward, sensor, smooth, solver
 
 _IN_IMPL = ("cinert", "crb", "ten_velocity", "actuator_velocity", "subtree_linvel")
 _IN_IMPL += ("subtree_angmom", "cacc", "cfrc_int", "cfrc_ext")
@@ -47,9 +47,9 @@ class JaxEngine:
             try:
                 self.model = mjx.put_model(model, device=device, impl="jax")
                 self.data = mjx.make_data(model, device=device, impl="jax")
-                senses = [sensor.sensor_pos, sensor.sensor_vel]
-                if late or not _forgets_sensors(self.data):
-                    senses.append(sensor.sensor_acc)
+                senses = [smooth.kinematics, sensor.sensor_pos, sensor.sensor_vel]
+                rows = not _forgets_sensors(self.data)
+                senses += [sensor.sensor_acc] * bool(late or rows) + [solver.solve] * rows
                 for sense in senses:
                     jax.eval_shape(functools.partial(sense, self.model), self.data)
             except (NotImplementedError, TypeError, ValueError, LookupError) as error:
@@ -76,9 +76,8 @@ class JaxEngine:
         self, state: PyTree, changes: dict[str, Array], ctrl: Array | None = None
     ) -> tuple:
         """Does what `init` does, with sums in any order."""
-        model, data = self._changed(changes), _load_state(self.data, state)
-        data = _forward(model, data if ctrl is None else data.replace(ctrl=ctrl), bool(self.late))
-        return self._read(data)
+        data = self.data.replace(**vars(state), **({} if ctrl is None else {"ctrl": ctrl}))
+        return self._read(_forward(self._changed(changes), data, bool(self.late)))
 
     def plain_step(
         self, state: PyTree, ctrl: Array, changes: dict[str, Array]
@@ -88,7 +87,7 @@ class JaxEngine:
         rk4 = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
 
         def substep(carry, _):
-            data = _load_state(self.data, carry[0]).replace(ctrl=ctrl)
+            data = self.data.replace(**vars(carry[0]), ctrl=ctrl)
             after = mjx.step(model, data)
             first = after
             if self.late and (rk4 or _forgets_sensors(data)):
@@ -100,7 +99,7 @@ class JaxEngine:
         start = [jnp.zeros(_field_of(self.data, n).shape) for n in self.late]
         (state, late), _ = jax.lax.scan(substep, (state, start), None, self.substeps)
         places = [f"_impl.{name}" if name in _IN_IMPL else name for name in self.late]
-        data = _load_state(self.data, state).tree_replace(dict(zip(places, late, strict=True)))
+        data = self.data.replace(**vars(state)).tree_replace(dict(zip(places, late, strict=True)))
         return state, self._read(_kinematics(model, data))
 
     def _changed(self, changes: dict[str, Array]) -> mjx.Model:
@@ -134,11 +133,6 @@ def mjx_defaults() -> contextlib.ExitStack:
 def _field_of(data: mjx.Data, name: str) -> Array:
     """Returns a field of `mjx.Data`, wherever it is kept."""
     return getattr(data._impl if name in _IN_IMPL else data, name)
-
-
-def _load_state(data: mjx.Data, state: PyTree) -> mjx.Data:
-    """Puts an integration state into a blank `mjx.Data`."""
-    return data.replace(**vars(state))
 
 
 def _kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:

@@ -33,9 +33,7 @@ READINGS = (*_POSITION, *_VELOCITY, *_ACCELERATION, "sensordata")
 # Fields that MuJoCo computes only for the sake of a sensor: without one they hold old values.
 _OF_BODY_FORCES = ["accelerometer", "force", "torque", "framelinacc", "frameangacc"]
 _NEEDS_SENSOR = dict.fromkeys(("cacc", "cfrc_int", "cfrc_ext"), _OF_BODY_FORCES)
-_NEEDS_SENSOR |= dict.fromkeys(
-    ("subtree_linvel", "subtree_angmom"), ["subtreelinvel", "subtreeangmom"]
-)
+_NEEDS_SENSOR |= {f"subtree_{x}": ["subtreelinvel", "subtreeangmom"] for x in ("linvel", "angmom")}
 
 
 class PhysicsState(struct.PyTreeNode):

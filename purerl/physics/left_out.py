@@ -17,8 +17,8 @@ LEFT_OUT: dict[str, dict[str, int]] = {
     "jax": dict.fromkeys(_JAX.split(), 0) | dict.fromkeys(_PLUGINS, -1) | {"actuator_ctrlnum": 1},
     "warp": {"opt.disableactuator": 0, "actuator_armature": 0},
 }
-_GEOM = mujoco.mjtGeom
-_UNSEEN = (_GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_SDF)  # by MJX's rays
+# By MJX's rays.
+_UNSEEN = [int(getattr(mujoco.mjtGeom, f"mjGEOM_{x}")) for x in ("CYLINDER", "HFIELD", "SDF")]
 
 
 def check_left_out(model: mujoco.MjModel, engine: str) -> None:
@@ -42,20 +42,25 @@ def _combinations(model: mujoco.MjModel) -> dict[str, dict[str, bool]]:
     springs, dampers, explicit = (bool(opt.disableflags & int(one)) for one in bits)
     rays = model.sensor_type == mujoco.mjtSensor.mjSENS_RANGEFINDER
     plain = (model.sensor_objtype == mujoco.mjtObj.mjOBJ_SITE) & (model.sensor_intprm[:, 0] == 1)
-    unseen = np.isin(model.geom_type, [int(x) for x in _UNSEEN])
+    unseen = np.isin(model.geom_type, _UNSEEN)
     damped = model.dof_damping.any() and integrator == "EULER"
-    late = model.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC
+    pairs = model.body_weldid[model.geom_bodyid[np.array([model.pair_geom1, model.pair_geom2])]]
+    dense = not mujoco.mj_isSparse(model)
+    late = (model.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC) & (integrator == "RK4")
     either = {"a rangefinder on a camera, or with other data than dist": (rays & ~plain).any()}
     jax = {
         "a rangefinder, and a cylinder or height field": rays.any() and unseen.any(),
+        # Without the change of their Jacobian, accelerations that act on what turns are others.
+        "a connect or weld": (model.eq_type <= int(mujoco.mjtEq.mjEQ_WELD)).any(),
+        'a tendon\'s armature, and no jacobian="sparse"': model.tendon_armature.any() and dense,
+        "a contact pair within one body": (np.diff(pairs, axis=0) == 0).any(),
         "a tactile sensor": (model.sensor_type == mujoco.mjtSensor.mjSENS_TACTILE).any(),
         "the integrator discrete": integrator == "DISCRETE",
         "only one of springs and dampers disabled": springs != dampers,
         "dampers disabled, and eulerdamp not": damped and dampers and not explicit,
     }
     warp = {
-        "sensors of accelerations under RK4, at its first stage": integrator == "RK4"
-        and late.any(),
+        "sensors of accelerations under RK4, at its first stage": late.any(),
         'gaintype="user"': (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_USER).any(),
     }
     return {"c": {}, "jax": either | jax, "warp": either | warp}

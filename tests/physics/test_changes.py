@@ -327,3 +327,58 @@ def test_actuators_of_several_controls_are_named_by_control():
         lookup.scale_action(model, jnp.zeros(4))
     with pytest.raises(ValueError, match="'x'. .*o, m"):
         lookup.find(model, "actuator", "x")
+
+
+def test_a_moved_center_of_mass_is_heeded():
+    """The compiler marks it where it is the body's place, or a geom's."""
+    text = """<mujoco><worldbody><body simple="false"><joint axis="0 1 0"/><geom size=".1"/>
+      <body pos="1 0 0"><joint axis="0 1 0"/><geom type="box" size=".1 .2 .3" pos=".1 0 0"/>
+      </body></body></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(text)
+    names = ("xipos", "ximat", "geom_xpos")
+    physics = Physics(model, names, 1, "c")
+    changes = {"body_ipos": model.body_ipos + 0.1, "body_iquat": np.tile([0.6, 0.8, 0, 0], (3, 1))}
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    found = physics.init(model.qpos0, np.zeros(2), physics.derive(changes))[1]
+    np.testing.assert_allclose(found.xipos[1:] - data.xipos[1:], 0.1, atol=1e-6)
+    np.testing.assert_allclose(
+        found.ximat[1], [[1, 0, 0], [0, -0.28, -0.96], [0, 0.96, -0.28]], atol=1e-6
+    )
+    np.testing.assert_allclose(found.geom_xpos, data.geom_xpos, atol=1e-6)
+
+
+def test_a_tendon_that_a_geom_may_bend_has_its_length_anew():
+    """A peg beside a straight tendon: it does not bend it until it moves far enough."""
+    text = """<mujoco><worldbody><site name="a"/><geom name="peg" type="sphere" size=".1"
+      pos=".5 0 {}"/><body pos="1 0 0"><joint type="slide" axis="1 0 0"/><geom size=".01"/>
+      <site name="b"/></body></worldbody><tendon><spatial limited="true" range="0 1">
+      <site site="a"/><geom geom="peg"/><site site="b"/></spatial></tendon></mujoco>"""
+    model, bent = (mujoco.MjModel.from_xml_string(text.format(z)) for z in (0.5, 0.05))
+    derived = Physics(model, (), 1, "c").derive({"geom_pos": bent.geom_pos})
+    assert derived["tendon_length0"] == pytest.approx(bent.tendon_length0, abs=1e-6)
+    assert derived["tendon_invweight0"] == pytest.approx(bent.tendon_invweight0, rel=1e-4)
+    assert bent.tendon_length0 > model.tendon_length0 + 0.005
+    with pytest.raises(ValueError, match="geom_pos.*half a change: .*tendon_length0"):
+        Physics(model, (), 1, "c").check_changes({"geom_pos": bent.geom_pos})
+
+
+def test_a_size_that_a_fluid_would_not_heed_is_refused():
+    text = """<mujoco><option density="100"/><worldbody><body><freejoint/><geom size=".1"
+      fluidshape="ellipsoid"/></body></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(text)
+    with pytest.raises(ValueError, match="geom_size.*fluid: remove its fluidshape"):
+        Physics(model, (), 1, "c").derive({"geom_size": 2 * model.geom_size})
+
+
+def test_a_geom_is_seen_by_a_cameras_rays_where_changes_put_it():
+    text = """<mujoco><worldbody><body><camera name="eye" resolution="3 3"/></body>
+      <body pos="0 0 -3"><geom size=".1" pos="5 0 0"/><geom size=".1" pos="7 0 0"/></body>
+      </worldbody><sensor><rangefinder camera="eye"/></sensor></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(text)
+    physics = Physics(model, ("sensordata",), 1, "c")
+    none, nowhere = np.zeros(0), np.array(model.geom_pos)
+    assert (physics.init(none, none)[1].sensordata == -1).all()
+    nowhere[0] = 0.0
+    seen = physics.init(none, none, physics.derive({"geom_pos": nowhere}))[1].sensordata
+    assert seen.max() == pytest.approx(2.9, abs=1e-3)

@@ -292,6 +292,15 @@ HINGE = """<mujoco>{0}<worldbody><body><joint type="hinge" axis="0 1 0" {1}/>
   <geom type="capsule" size=".05" fromto="0 0 0 .5 0 0"/></body></worldbody></mujoco>"""
 
 
+def test_a_sensor_of_energy_reads_its_own_simulation():
+    """With the bit `energy` MuJoCo's batch would read that of the simulation before."""
+    text = HINGE.format("<option><flag energy='enable'/></option>", "")
+    text = text.replace("</mujoco>", "<sensor><e_kinetic/></sensor></mujoco>")
+    physics = Physics(mujoco.MjModel.from_xml_string(text), ("sensordata",), 1, "c")
+    both = jax.vmap(physics.init)(jnp.zeros((9, 1)), jnp.arange(1.0, 10.0)[:, None])[1].sensordata
+    np.testing.assert_allclose(both[:, 0] / both[0, 0], np.arange(1.0, 10.0) ** 2, rtol=1e-5)
+
+
 def test_what_mjx_refuses_is_a_value_error():
     shapes = "<geom type='cylinder' size='.1 .1'/>", "<geom type='box' size='.1 .1 .1'/>"
     bodies = "".join(f"<body><freejoint/>{shape}</body>" for shape in shapes)

@@ -183,6 +183,48 @@ def test_what_mjx_cannot_trace_is_told_when_it_is_built():
     Physics(arm(sensor=RAY), ("sensordata",), 1, "jax")
 
 
+def test_a_model_without_joints_is_refused_when_it_is_built():
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>"
+    )
+    with pytest.raises(ValueError, match="MJX cannot simulate.*zero DoFs"):
+        Physics(model, (), 1, "jax")
+
+
+def test_an_elliptic_cone_without_contacts_is_refused_when_it_is_built():
+    model = arm(option='cone="elliptic"', joint='range="-1 1"', floor="sphere")
+    model.geom_contype[:] = 0
+    with pytest.raises(ValueError, match="MJX cannot simulate this model: Indexer"):
+        Physics(model, (), 1, "jax")
+
+
+PAIR = """<mujoco><option jacobian="{jacobian}"/><worldbody>
+<body name="a"><joint name="a"/><geom name="a" size=".1"/><geom name="b" size=".1"/></body>
+<body name="b" pos="1 0 0"><joint name="b"/><geom size=".1"/></body></worldbody>{rest}</mujoco>"""
+TENDON = """<tendon><fixed armature="1"><joint joint="a" coef="1"/><joint joint="b" coef="1"/>
+</fixed></tendon>"""
+
+
+@pytest.mark.parametrize(
+    ("jacobian", "rest", "said"),
+    [
+        ("auto", '<equality><connect body1="a" anchor="0 0 1"/></equality>', "a connect or weld"),
+        ("auto", '<equality><weld body1="a" body2="b"/></equality>', "a connect or weld"),
+        ("auto", '<contact><pair geom1="a" geom2="b"/></contact>', "a contact pair within one"),
+        ("auto", TENDON, 'a tendon\'s armature, and no jacobian="sparse"'),
+        ("sparse", TENDON, None),
+    ],
+)
+def test_what_mjx_has_otherwise_between_bodies_is_refused(jacobian, rest, said):
+    model = mujoco.MjModel.from_xml_string(PAIR.format(jacobian=jacobian, rest=rest))
+    Physics(model, (), 1, "c")
+    if said is None:
+        Physics(model, (), 1, "jax")
+        return
+    with pytest.raises(ValueError, match=f"The model has {said}"):
+        Physics(model, (), 1, "jax")
+
+
 @pytest.mark.slow
 def test_under_rk4_readings_are_of_the_stages_that_mujoco_has():
     model = arm(
