@@ -267,6 +267,9 @@ def check_solver(env: Env, physics: Any, trial: Trial) -> Iterator[Finding]:
     good = np.isfinite(old + best).all(-1)
     if not good.any():
         return
+    if physics.engine == "jax" and (solved.eq_type < 2).any():
+        what = "MJX has connects and welds without the change of their Jacobian: what they hold"
+        yield warning("solver", f"{what} accelerates wrongly while it turns fast.")
     gap, moved = (np.abs(x - best)[good].max() for x in (own, old))
     what = f"{opt.iterations} iterations ({opt.ls_iterations} of line search)"
     said = f"after one control step qpos is up to {gap:.2g} from a converged solver's, by {what}"

@@ -4,12 +4,9 @@ What belongs here: cameras on bodies, the shapes that rays meet, how light makes
 May import: core, ppo, physics. Read: `eye.py`, `eyes.py`, `casting.py`; then `networks.py`.
 """
 
-from purerl.eyes.eye import Eye as Eye, of_camera as of_camera, pair as pair, rotation as rotation
-from purerl.eyes.eyes import Eyes as Eyes
-from purerl.eyes.networks import (
-    Encoder as Encoder,
-    MlpOptions as MlpOptions,
-    RecurrentOptions as RecurrentOptions,
-    mlp as mlp,
-    recurrent as recurrent,
-)
+from purerl.eyes.eye import Eye, of_camera, pair, rotation
+from purerl.eyes.eyes import Eyes
+from purerl.eyes.networks import Encoder, MlpOptions, RecurrentOptions, mlp, recurrent
+
+__all__ = ["Encoder", "Eye", "Eyes", "MlpOptions", "RecurrentOptions", "mlp", "of_camera"]
+__all__ += ["pair", "recurrent", "rotation"]

@@ -50,8 +50,6 @@ def _combinations(model: mujoco.MjModel) -> dict[str, dict[str, bool]]:
     either = {"a rangefinder on a camera, or with other data than dist": (rays & ~plain).any()}
     jax = {
         "a rangefinder, and a cylinder or height field": rays.any() and unseen.any(),
-        # Without the change of their Jacobian, accelerations that act on what turns are others.
-        "a connect or weld": (model.eq_type <= int(mujoco.mjtEq.mjEQ_WELD)).any(),
         'a tendon\'s armature, and no jacobian="sparse"': model.tendon_armature.any() and dense,
         "a contact pair within one body": (np.diff(pairs, axis=0) == 0).any(),
         "a tactile sensor": (model.sensor_type == mujoco.mjtSensor.mjSENS_TACTILE).any(),

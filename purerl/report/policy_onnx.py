@@ -74,7 +74,7 @@ def build_model(
 
 
 def _info(name: str, shape: tuple[int, ...], like: Any) -> onnx.ValueInfoProto:
-    kind = helper.np_dtype_to_tensor_dtype(np.dtype(like.dtype))
+    kind = onnx.TensorProto.UINT8 if like.dtype == np.uint8 else onnx.TensorProto.FLOAT
     return helper.make_tensor_value_info(name, kind, ["batch", *shape])
 
 
