@@ -107,6 +107,7 @@ def ant():
     return env, jax.jit(env.reset), jax.jit(env.step)
 
 
+@pytest.mark.slow
 def test_the_actor_is_not_told_of_edges(ant):
     env, reset, _ = ant
     told = jax.jit(run.build(run.Options(arena="gaps"), "c").reset)
@@ -116,6 +117,7 @@ def test_the_actor_is_not_told_of_edges(ant):
     assert np.array_equal(np.concatenate([seen["policy"], seen["privileged"]]), known)
 
 
+@pytest.mark.slow
 def test_a_gap_ahead_is_seen_and_each_episode_has_its_own(ant):
     env, reset, _ = ant
 
@@ -135,6 +137,7 @@ def places(env, state):
     return readings.xpos, readings.xmat, env.scenery(state)
 
 
+@pytest.mark.slow
 def test_an_eye_is_closed_for_a_whole_episode(ant):
     _, reset, step = ant
     closed = []
@@ -147,8 +150,7 @@ def test_an_eye_is_closed_for_a_whole_episode(ant):
     assert {(False, False), (True, False), (False, True)} == set(closed)
 
 
-def test_noise_is_drawn_anew_at_each_step(ant):
-    _, _, _ = ant
+def test_noise_is_drawn_anew_at_each_step():
     options = sight.Sight(number=1, noise=0.1)
     drawn = sight.draw(jax.random.key(0), options)
     flat = jnp.full((1, 32, 32), 128, jnp.uint8)
