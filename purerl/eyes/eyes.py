@@ -63,14 +63,14 @@ class Eyes:
         """Returns grey pictures, [E, H, W] uint8, upper row first.
 
         Args:
-          xpos: of the model's bodies [nbody, 3] [m], a reading.
-          xmat: their axes [nbody, 3, 3], a reading.
-          boxes: what stands around in this episode: centers and half sizes, [P, 3] each [m].
+          xpos: a reading, of the model's bodies [nbody, 3], in metres.
+          xmat: a reading, their axes [nbody, 3, 3].
+          boxes: what stands around in this episode: centers and half sizes [P, 3], in metres.
         """
         return self._each(self._picture, xpos, xmat, boxes)
 
     def distance(self, xpos: Array, xmat: Array, boxes: casting.Boxes | None = None) -> Array:
-        """Returns how far what is seen is along each ray, [E, H, W] [m]; inf: nothing there."""
+        """Returns how far what is seen is along each ray [m], [E, H, W]; inf: nothing there."""
         return self._each(lambda t, *_: t * self.stretch, xpos, xmat, boxes)
 
     def _each(
@@ -78,6 +78,8 @@ class Eyes:
     ) -> Array:
         """Returns what `answer` makes of each eye's entries, [E, H, W]."""
         boxes = boxes or (jnp.zeros((0, 3)), jnp.zeros((0, 3)))
+        if not len(self.shapes.kind) + len(boxes[0]):
+            raise ValueError("There is nothing to see: every geom is hidden, and no box is given.")
         turn = xmat[self.body]
 
         def one(position: Array, axes: Array) -> Array:

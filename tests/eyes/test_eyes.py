@@ -179,8 +179,12 @@ def test_what_is_hidden_clear_or_far_is_not_seen():
         return bool(np.isfinite(distance(sight, xpos, xmat)).any())
 
     assert seen("")
-    assert not seen("", hide=["ball"]) and not seen("", reach=0.8)
-    assert not seen('rgba="1 1 1 0"') and not seen('group="3"')
+    assert not seen("", reach=0.8)
+    with pytest.raises(ValueError, match="There is nothing to see: every geom is hidden"):
+        seen("", hide=["ball"])
+    for clear in ('rgba="1 1 1 0"', 'group="3"'):
+        with pytest.raises(ValueError, match="There is nothing to see"):
+            seen(clear)
 
 
 def test_an_eye_looks_through_what_it_is_in():
