@@ -170,7 +170,7 @@ def test_blur_keeps_the_mean_and_spreads_a_point():
 
 @pytest.mark.slow
 def test_engines_see_the_same():
-    """10 s: an arm of three links and its eye. Positions differ in their last bits, pixels hardly."""
+    """10 s: an arm of three links and its eye; positions differ in their last bits."""
     links = '<body pos="0 0 .3"><joint axis="0 1 .3"/><geom type="capsule" size=".03 .1"/>{}</body>'
     arm = links.format(links.format(links.format('<body name="eye" pos=".1 0 .1"/>')))
     model = mujoco.MjModel.from_xml_string(
