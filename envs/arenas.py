@@ -19,9 +19,11 @@ from dm_control.locomotion.arenas import corridors, floors
 
 from purerl import Array
 from purerl.envs.bodies import Body
+from purerl.envs.mazes import Maze
 
 GROUND = "ground"  # the floor's geom; a corridor's boxes are ground_0, ground_1, ...
 TARGET = "target"  # body and geom of the floor's orb
+TREAT = 0.05  # radius of a maze's targets [m]
 _THICKNESS = 0.16  # half height of a platform, as in dm_control [m]
 
 
@@ -72,12 +74,12 @@ class GapsCorridor:
         return max(self.start_length, self.platform_length[1])
 
 
-Arena = Floor | GapsCorridor
+Arena = Floor | GapsCorridor | Maze
 
 
 def check_passable(arena: Arena, body: Body) -> None:
     """Raises if a gap can be wider than the body can cross, or a window miss what it touches."""
-    if isinstance(arena, Floor):
+    if not isinstance(arena, GapsCorridor):
         return
     if arena.gap_length[1] > body.longest_gap:
         raise ValueError(
@@ -105,6 +107,8 @@ def build_arena(arena: Arena) -> mjcf.RootElement:
     """Returns dm_control's arena with our ground in it."""
     if isinstance(arena, Floor):
         return _build_floor(arena)
+    if isinstance(arena, Maze):
+        return _build_maze(arena)
     root = corridors.EmptyCorridor(name="arena", visible_side_planes=False).mjcf_model
     _remove_walls(root)
     material = _checker(root, tile=0.5)
@@ -123,10 +127,27 @@ def _build_floor(arena: Floor) -> mjcf.RootElement:
     dm_floor.ground_geoms[0].material.texrepeat = [2 / arena.tile] * 2
     root = dm_floor.mjcf_model
     if arena.orb:
-        body = root.worldbody.add("body", name=TARGET, mocap=True)
-        white = {"contype": 0, "conaffinity": 0, "rgba": [1, 1, 1, 1]}
-        body.add("geom", name=TARGET, type="sphere", size=[arena.orb], **white)
+        _add_target(root, TARGET, arena.orb)
     return root
+
+
+def _build_maze(arena: Maze) -> mjcf.RootElement:
+    """A floor, a window of walls, and the treats."""
+    root = _build_floor(Floor())
+    half = [arena.cell / 2, arena.cell / 2, arena.height / 2]
+    for i in range(arena.boxes):
+        body = root.worldbody.add("body", name=f"{GROUND}_{i}")
+        body.add("geom", name=f"{GROUND}_{i}", type="box", size=half, mass=0)
+    for i in range(arena.targets):
+        _add_target(root, f"{TARGET}_{i}", TREAT)
+    return root
+
+
+def _add_target(root: mjcf.RootElement, name: str, radius: float) -> None:
+    """Adds a ball [m] that can be anywhere and hinders nothing."""
+    body = root.worldbody.add("body", name=name, mocap=True)
+    white = {"contype": 0, "conaffinity": 0, "rgba": [1, 1, 1, 1]}
+    body.add("geom", name=name, type="sphere", size=[radius], **white)
 
 
 def _remove_walls(root: mjcf.RootElement) -> None:

@@ -153,7 +153,7 @@ def mask_contacts(model: mujoco.MjModel, body: Body, self_collision: bool) -> No
     for i in range(model.ngeom):
         name = model.geom(i).name
         part = name.removeprefix(PREFIX)
-        ground = not name.startswith(PREFIX) and name != TARGET
+        ground = not name.startswith(PREFIX) and not name.startswith(TARGET)
         chosen = part in body.ground_geoms if body.ground_geoms else model.geom_contype[i] > 0
         model.geom_contype[i] = 0 if ground else int(chosen)
         # As shipped, a geom with conaffinity 0 touches the ground and not its own kind.
