@@ -1,8 +1,10 @@
 """The window's parts that need no browser: numbers, words, pushes, shapes, ports."""
 
+import contextlib
 import dataclasses
 import shlex
 import socket
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -16,6 +18,7 @@ from purerl.physics.drawing import Picture, Stage
 from purerl.tune import overrides
 from purerl.tune.option_numbers import bounds, label, numbers_of, replaced
 from purerl.tune.view import loop, opening, push, shapes
+from purerl.tune.view.page import Page
 
 # --- numbers ---
 
@@ -200,3 +203,23 @@ def test_checkpoints_of_a_folder_that_is_gone(tmp_path):
     (tmp_path / "checkpoints" / "000000000012").mkdir()
     names = opening.checkpoint_names(tmp_path, "latest")
     assert names == ["latest", "best", "12", "7"]
+
+
+def test_what_the_eyes_see_is_shown_and_moves_on():
+    """Without a server: a page adds one picture, and changes it with each state."""
+    shown = []
+
+    def add_image(image, label):
+        shown.append(SimpleNamespace(image=image, label=label))
+        return shown[-1]
+
+    own = Page.__new__(Page)
+    own.eyes, own.tab = None, contextlib.nullcontext()
+    own.server = SimpleNamespace(gui=SimpleNamespace(add_image=add_image))
+    seen = np.arange(32, dtype=np.uint8).reshape(2, 4, 4)  # two eyes of 4 x 4
+    for eyes in ((), (seen,), (seen + 100,)):
+        picture = Picture(np.zeros(1), np.zeros((0, 3)), np.zeros((0, 4)), {}, (), eyes)
+        own._draw_eyes(SimpleNamespace(picture=picture))
+    assert len(shown) == 1
+    image = shown[0].image
+    assert image.shape == (160, 320, 3) and image[0, 160, 0] == seen[1, 0, 0] + 100
