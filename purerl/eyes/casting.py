@@ -79,9 +79,12 @@ def before_eye(
 
 
 def in_view(seen: Seen, rays: np.ndarray, reach: float) -> Array:
-    """Tells which shapes' bounding spheres are in the pyramid of an eye's rays, [S] bool."""
+    """Tells which shapes' bounding spheres are in the pyramid of an eye's rays, [S] bool.
+
+    A box of no size, as of a wall that an episode does not have, is not.
+    """
     ahead, radius = -seen.center[:, 2], seen.radius
-    visible = (ahead > -radius) & (ahead - radius < reach)
+    visible = (radius > 0.0) & (ahead > -radius) & (ahead - radius < reach)
     for k, half in enumerate(np.abs(rays).max(axis=1)):
         outside = jnp.abs(seen.center[:, k]) - half * ahead
         visible &= outside <= 1.0001 * radius * np.sqrt(1.0 + half * half)

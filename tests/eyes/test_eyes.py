@@ -120,9 +120,12 @@ def test_boxes_of_an_episode_are_seen_like_those_of_the_model():
     sight = eyes.Eyes(compiled, [EYE], hide=())
     _, xpos, xmat = places(model_of(still), [1.0, 0.3, 0.5], [0, 0, 0])
     bare = eyes.Eyes(model_of(), [EYE])
-    boxes = jnp.array([[0.0, 0.1, 0.0], [0.0, 9.0, 0.0]]), jnp.array([[0.3, 0.1, 0.2], [1.0, 1, 1]])
+    # The second is out of view, the third is before all and has no size.
+    centers = jnp.array([[0.0, 0.1, 0.0], [0.0, 9.0, 0.0], [0.5, 0.2, 0.25]])
+    boxes = centers, jnp.array([[0.3, 0.1, 0.2], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
     found = distance(bare, xpos, xmat, boxes)
     assert np.array_equal(distance(sight, xpos, xmat), found) and np.isfinite(found).any()
+    assert len(np.unique(picture(bare, xpos, xmat, boxes))) > 4
 
 
 def test_upright_and_right_way_round():
