@@ -66,7 +66,7 @@ class Forage:
         rest = jnp.asarray(self.physics.model.qpos0, jnp.float32)
         qpos = rest.at[:2].set(drawn.start).at[3].set(jnp.cos(half)).at[6].set(jnp.sin(half))
         targets = jnp.pad(drawn.targets, ((0, 0), (0, 1)), constant_values=HEIGHT)
-        task = {"free": drawn.free, "targets": targets}
+        task: dict[str, Any] = {"free": drawn.free, "targets": targets}
         task |= {"found": jnp.zeros(len(targets), bool)}
         task |= {"eyes": sight.draw(eyes_key, self.options.eyes)}
         changes = self._walls(task, qpos)
