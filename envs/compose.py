@@ -44,6 +44,8 @@ class Composed:
     torso: int  # body id; its subtree is the walker and nothing else
     end_effectors: tuple[int, ...]  # body ids
     joints: tuple[int, ...]  # ids of the walker's own joints, without the free one
+    qpos: tuple[int, ...]  # where they stand in qpos
+    qvel: tuple[int, ...]  # where they stand in qvel
     boxes: BoxFields  # the corridor's movable boxes; none on a floor
     looks: mujoco.MjModel  # as it was compiled, before it was simplified: what eyes see
 
@@ -240,13 +242,17 @@ def _name_parts(model: mujoco.MjModel, looks: mujoco.MjModel, body: Body, arena:
         lookup.find(model, "geom", f"{GROUND}_{i}") for i in range(getattr(arena, "boxes", 0))
     )
     free = mujoco.mjtJoint.mjJNT_FREE
+    joints = tuple(i for i in range(model.njnt) if model.jnt_type[i] != free)
+    own = [lookup.names(model, "joint")[i] for i in joints]
     return Composed(
         model=model,
         body=body,
         arena=arena,
         torso=lookup.find(model, "body", PREFIX + body.torso),
         end_effectors=tuple(lookup.find(model, "body", PREFIX + n) for n in body.end_effectors),
-        joints=tuple(i for i in range(model.njnt) if model.jnt_type[i] != free),
+        joints=joints,
+        qpos=tuple(lookup.qpos_indices(model, own).tolist()),
+        qvel=tuple(lookup.qvel_indices(model, own).tolist()),
         boxes=box_fields(model, boxes),
         looks=looks,
     )

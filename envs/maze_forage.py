@@ -17,7 +17,7 @@ from purerl.envs import mazes, sight
 from purerl.envs.arenas import TARGET, TREAT
 from purerl.envs.bodies import RODENT
 from purerl.envs.compose import PREFIX, Composed, compose
-from purerl.envs.feeling import READINGS, felt, indices
+from purerl.envs.feeling import READINGS, felt
 from purerl.envs.mazes import Maze
 from purerl.envs.two_touch import distance_to_ellipsoid
 
@@ -47,8 +47,6 @@ class Forage:
     physics: Physics
     parts: Composed
     maze: Maze
-    joints: tuple[int, ...]  # of qpos
-    dofs: tuple[int, ...]  # of qvel
     touching: tuple[int, ...]  # geom ids, ellipsoids: what finds
     action_size: int
     eyes: seeing.Eyes | None
@@ -120,7 +118,7 @@ class Forage:
         away = task["targets"] - readings.xpos[torso]
         far = jnp.where(found, jnp.inf, jnp.sqrt(jnp.square(away).sum(1)))
         nearest = jnp.where(found.all(), 0.0, readings.xmat[torso].T @ away[jnp.argmin(far)])
-        parts = felt(self.parts, self.joints, self.dofs, physics, readings, action)
+        parts = felt(self.parts, physics, readings, action)
         told = jnp.append(nearest, found.mean(dtype=jnp.float32))
         if self.eyes is None:
             observation: Any = jnp.concatenate([*parts, told])
@@ -145,7 +143,6 @@ def build(options: Options = Options(), engine: str = "auto") -> Forage:  # noqa
     """Builds the environment on an engine of `purerl.physics.interface`."""
     maze = Maze(rooms=options.rooms)
     parts = compose(RODENT, maze, engine)
-    joints, dofs = indices(parts)
     own = [i for i, n in enumerate(lookup.names(parts.looks, "geom")) if n.startswith(PREFIX)]
     round_ = parts.looks.geom_type == mujoco.mjtGeom.mjGEOM_ELLIPSOID
     eye = seeing.of_camera(parts.looks, PREFIX + RODENT.camera)
@@ -155,8 +152,6 @@ def build(options: Options = Options(), engine: str = "auto") -> Forage:  # noqa
         physics=Physics(parts.model, READINGS, options.substeps, engine),
         parts=parts,
         maze=maze,
-        joints=joints,
-        dofs=dofs,
         touching=tuple(i for i in own if round_[i]),
         action_size=parts.model.nu,
         eyes=sight.build(parts.looks, eye, RODENT.eye_distance, options.eyes, window),

@@ -35,7 +35,7 @@ from purerl.envs.arenas import (
 )
 from purerl.envs.bodies import ANT, RODENT, Body
 from purerl.envs.compose import PREFIX, Composed, compose
-from purerl.envs.feeling import READINGS, felt, indices
+from purerl.envs.feeling import READINGS, felt
 
 BODIES = {"ant": ANT, "rodent": RODENT}
 BODY_READINGS = ("cinert", "cvel")
@@ -117,8 +117,6 @@ class Run:
     options: Options
     physics: Physics
     parts: Composed
-    joints: tuple[int, ...]  # of qpos
-    dofs: tuple[int, ...]  # of qvel
     action_size: int
     eyes: seeing.Eyes | None
 
@@ -131,11 +129,11 @@ class Run:
         """Starts standing, limbs and velocities drawn around rest, in a corridor of its own."""
         limbs_key, velocity_key, course_key, model_key = jax.random.split(key, 4)
         model, noise = self.physics.model, self.options.reset_noise
-        limbs = jax.random.uniform(limbs_key, (len(self.joints),), minval=-noise, maxval=noise)
+        limbs = jax.random.uniform(limbs_key, (len(self.parts.qpos),), minval=-noise, maxval=noise)
         qvel = jax.random.uniform(velocity_key, (model.nv,), minval=-noise, maxval=noise)
         rest = jnp.asarray(model.qpos0, jnp.float32)
         # Unique: a sum of terms that might meet would have no fixed order on a GPU.
-        qpos = rest.at[jnp.array(self.joints)].add(limbs, unique_indices=True)
+        qpos = rest.at[jnp.array(self.parts.qpos)].add(limbs, unique_indices=True)
         factors = draw_factors(model_key, self.options.randomization)
         task: dict[str, Any] = {"factors": factors}
         if factors:
@@ -217,7 +215,7 @@ class Run:
         With eyes: a dict of `policy` [O], `eyes` [E, H, W] uint8 and, in a corridor, `privileged`,
         which is what lies ahead.
         """
-        parts = felt(self.parts, self.joints, self.dofs, physics, readings, action)
+        parts = felt(self.parts, physics, readings, action)
         if self.options.observe_place:
             parts.append(physics.qpos[:2])
         if self.options.observe_bodies:
@@ -322,7 +320,6 @@ def build(options: Options = Options(), engine: str = "auto") -> Run:  # noqa: B
     body = BODIES[options.body]
     parts = compose(body, build_arena(options, body), engine)
     model = parts.model
-    joints, dofs = indices(parts)
     readings = READINGS + (BODY_READINGS if options.observe_bodies else ())
     readings += overflow_reading(engine)
     window = tuple(lookup.names(model, "geom")[i] for i in parts.boxes.boxes)
@@ -331,8 +328,6 @@ def build(options: Options = Options(), engine: str = "auto") -> Run:  # noqa: B
         options=options,
         physics=Physics(model, readings, options.substeps, engine),
         parts=parts,
-        joints=joints,
-        dofs=dofs,
         action_size=model.nu,
         eyes=sight.build(parts.looks, eye, body.eye_distance, options.eyes, window),
     )

@@ -16,7 +16,7 @@ from purerl.envs import sight
 from purerl.envs.arenas import TARGET, Floor
 from purerl.envs.bodies import RODENT
 from purerl.envs.compose import PREFIX, Composed, compose
-from purerl.envs.feeling import READINGS, felt, indices
+from purerl.envs.feeling import READINGS, felt
 
 BEFORE, ONCE, TWICE, TOO_SOON, TOO_LATE = range(5)
 HEIGHT, AREA, RADIUS = 0.14, 1.5, 0.025  # of the orb: above the ground, +- from the middle [m]
@@ -43,8 +43,6 @@ class TwoTouch:
     options: Options
     physics: Physics
     parts: Composed
-    joints: tuple[int, ...]  # of qpos
-    dofs: tuple[int, ...]  # of qvel
     hands: tuple[int, ...]  # body ids
     palms: tuple[int, ...]  # geom ids, ellipsoids: what touches
     action_size: int
@@ -63,7 +61,7 @@ class TwoTouch:
         qpos = rest.at[3].set(jnp.cos(half)).at[6].set(jnp.sin(half))
         physics, readings = self.physics.init(qpos, jnp.zeros(self.physics.model.nv))
         task = {"key": later_key, "eyes": sight.draw(eyes_key, self.options.eyes)}
-        task |= {"orb": new_orb(orb_key, self.options.area), "right": jnp.zeros((), jnp.int32)}
+        task |= {"orb": new_orb(orb_key, self.options.area)}
         # The readings are of before the orb was put there: what depends on it is read a step later.
         physics = physics.replace(mocap_pos=task["orb"]["place"][None])
         place = readings.xpos.at[lookup.find(self.physics.model, "body", TARGET)]
@@ -82,8 +80,7 @@ class TwoTouch:
         physics, readings = self.physics.step(before, ctrl)
         touching = self._touching(readings, orb["place"])
         orb, earned = tapped(orb, touching, physics.time)
-        right = task["right"] + (orb["logic"] == TWICE) * (state.task["orb"]["logic"] == ONCE)
-        task = task | {"key": next_key, "orb": orb, "right": right.astype(jnp.int32)}
+        task = task | {"key": next_key, "orb": orb}
         return self._state(physics, readings, task, earned, action)
 
     def _touching(self, readings: Any, place: Array) -> Array:
@@ -103,7 +100,7 @@ class TwoTouch:
         away = jnp.abs(readings.xpos[jnp.array(self.hands)] - place).sum(1)
         near = NEAR * REWARD * jnp.exp(-3.0 * away).max()
         torso = self.parts.torso
-        parts = felt(self.parts, self.joints, self.dofs, physics, readings, action)
+        parts = felt(self.parts, physics, readings, action)
         parts.append(jax.nn.one_hot(logic, 5))  # dm_control tells it too, but not since when
         where = readings.xmat[torso].T @ (place - readings.xpos[torso])
         if self.eyes is None:
@@ -201,7 +198,6 @@ def distance_to_ellipsoid(point: Array, radii: Any) -> Array:
 def build(options: Options = Options(), engine: str = "auto") -> TwoTouch:  # noqa: B008
     """Builds the environment on an engine of `purerl.physics.interface`."""
     parts = compose(RODENT, Floor(orb=RADIUS), engine)
-    joints, dofs = indices(parts)
     hands = [lookup.find(parts.model, "body", f"{PREFIX}hand_{side}") for side in "LR"]
     palms = [lookup.find(parts.looks, "geom", f"{PREFIX}hand_{side}_collision") for side in "LR"]
     assert (parts.looks.geom_type[palms] == mujoco.mjtGeom.mjGEOM_ELLIPSOID).all()
@@ -210,8 +206,6 @@ def build(options: Options = Options(), engine: str = "auto") -> TwoTouch:  # no
         options=options,
         physics=Physics(parts.model, READINGS, options.substeps, engine),
         parts=parts,
-        joints=joints,
-        dofs=dofs,
         hands=tuple(hands),
         palms=tuple(palms),
         action_size=parts.model.nu,
