@@ -1,5 +1,7 @@
 """The arenas: an endless floor, and a corridor of platforms that differs in every episode.
 
+A maze's and a bowl's sizes, and what is drawn of them, are in `mazes.py` and `bowls.py`.
+
 The corridor's model holds only a few boxes, the window. Before each control step they become the
 platforms that the body can reach from where it is: `course_changes` is a pure function of the
 episode's course and the torso's position, applied as per-environment model fields. That is the
@@ -19,6 +21,7 @@ from dm_control.locomotion.arenas import corridors, floors
 
 from purerl import Array
 from purerl.envs.bodies import Body
+from purerl.envs.bowls import Bowl
 from purerl.envs.mazes import Maze
 
 GROUND = "ground"  # the floor's geom; a corridor's boxes are ground_0, ground_1, ...
@@ -74,7 +77,7 @@ class GapsCorridor:
         return max(self.start_length, self.platform_length[1])
 
 
-Arena = Floor | GapsCorridor | Maze
+Arena = Floor | GapsCorridor | Maze | Bowl
 
 
 def check_passable(arena: Arena, body: Body) -> None:
@@ -105,8 +108,8 @@ def boxes_in_reach(arena: GapsCorridor, reach: float) -> int:
 
 def build_arena(arena: Arena) -> mjcf.RootElement:
     """Returns dm_control's arena with our ground in it."""
-    if isinstance(arena, Floor):
-        return _build_floor(arena)
+    if isinstance(arena, Floor | Bowl):  # a bowl's terrain is in no model: `compose.add_planes`
+        return _build_floor(arena if isinstance(arena, Floor) else Floor())
     if isinstance(arena, Maze):
         return _build_maze(arena)
     root = corridors.EmptyCorridor(name="arena", visible_side_planes=False).mjcf_model

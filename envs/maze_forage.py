@@ -33,6 +33,10 @@ class Options:
     """Without eyes it is told where the nearest treat is."""
     reward: float = REWARD
     """For each treat."""
+    forward_weight: float = 0.0
+    """Reward for each step of a body that runs ahead of itself at `target_speed` or more."""
+    target_speed: float = 0.5
+    """Speed that earns all of it [m/s]."""
     rooms: int = 4
     """In a maze, with three treats each."""
     substeps: int = 5
@@ -128,15 +132,18 @@ class Forage:
             pictures = sight.spoil(sharp, task["eyes"], physics.time, self.options.eyes)
             observation = {"policy": jnp.concatenate(parts), "eyes": pictures, "privileged": told}
         number = new.sum(dtype=jnp.float32)
+        ahead = readings.xmat[torso, :, 0] @ physics.qvel[:3]
+        forward = self.options.forward_weight * jnp.clip(ahead / self.options.target_speed, 0, 1)
         return State(
             physics=physics,
             observation=observation,
-            reward=self.options.reward * number,
+            reward=self.options.reward * number + forward,
             terminated=found.all(),
             truncated=jnp.zeros((), bool),
-            metrics={"treats_count": number, "up": readings.xmat[torso, 2, 2]},
+            metrics={"treats_count": number, "up": readings.xmat[torso, 2, 2],
+                     "forward_velocity": ahead},
             task=task | {"found": found},
-        )
+        )  # fmt: skip
 
 
 def build(options: Options = Options(), engine: str = "auto") -> Forage:  # noqa: B008

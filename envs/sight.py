@@ -66,7 +66,7 @@ def build(model: Any, eye: eyes.Eye, distance: float, options: Sight, hide: tupl
 def draw(key: Array, options: Sight) -> dict[str, Array]:
     """Draws an episode's eyes: `open`, [E] bool, and a key for their noise."""
     drop_key, which_key, noise_key = jax.random.split(key, 3)
-    closed = jnp.array([options.closed == "left", options.closed == "right"][: options.number])
+    closed = jnp.array([options.closed == s for s in ("left", "right")[: options.number]], bool)
     if options.dropout:
         dropped = jax.random.uniform(drop_key) < options.dropout
         closed |= dropped & (jnp.arange(2) == jax.random.randint(which_key, (), 0, 2))

@@ -59,13 +59,12 @@ class TwoTouch:
         half = jnp.pi * jax.random.uniform(turn_key)
         rest = jnp.asarray(self.physics.model.qpos0, jnp.float32)
         qpos = rest.at[3].set(jnp.cos(half)).at[6].set(jnp.sin(half))
-        physics, readings = self.physics.init(qpos, jnp.zeros(self.physics.model.nv))
         task = {"key": later_key, "eyes": sight.draw(eyes_key, self.options.eyes)}
         task |= {"orb": new_orb(orb_key, self.options.area)}
-        # The readings are of before the orb was put there: what depends on it is read a step later.
-        physics = physics.replace(mocap_pos=task["orb"]["place"][None])
-        place = readings.xpos.at[lookup.find(self.physics.model, "body", TARGET)]
-        readings = readings._replace(xpos=place.set(task["orb"]["place"]))
+        place = jnp.asarray(self.physics.model.body_pos, jnp.float32)
+        orb = lookup.find(self.physics.model, "body", TARGET)
+        changes = {"body_pos": place.at[orb].set(task["orb"]["place"])}
+        physics, readings = self.physics.init(qpos, jnp.zeros(self.physics.model.nv), changes)
         action = jnp.zeros(self.action_size)
         return self._state(physics, readings, task, jnp.zeros(()), action)
 
