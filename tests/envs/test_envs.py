@@ -232,7 +232,7 @@ def test_a_body_that_may_climb_out_of_a_gap_has_crossed_it_when_it_stands():
 
 
 def test_a_trial_at_one_gap_ends_landed_fallen_or_stopped():
-    """Each is 1 in its own episode, summed over its steps; a gap may be wider than can be crossed."""
+    """Each is 1 in its own episode, summed over its steps; a gap may be too wide to cross."""
     env = run.build(run.Options(arena="single_gap", gap_length=(1.5, 1.5)), "c")
     assert env.parts.arena.boxes == 2
     told = jax.eval_shape(run.build(run.Options(arena="gaps"), "c").reset, jax.random.key(0))
