@@ -51,10 +51,10 @@ class Policy:
                 x = np.lib.stride_tricks.sliding_window_view(x, (kernel, kernel), (-3, -2))
                 x = np.moveaxis(x[..., ::stride, ::stride, :, :, :], -3, -1)
                 x = x.reshape(*x.shape[:-3], -1)
-                x = np.maximum(self._dense(f"{name}/layer{layer}", x), 0)
-            x = self._dense(f"{name}/features", x.reshape(*x.shape[:-3], -1))
+                x = np.maximum(self._dense(f"{name}/Dense_{layer}", x), 0)
+            x = self._dense(f"{name}/Dense_{len(a['windows'])}", x.reshape(*x.shape[:-3], -1))
             x = (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-6)
-            yield np.maximum(x * a[f"{name}/norm/scale"] + a[f"{name}/norm/bias"], 0)
+            yield np.maximum(x * a[f"{name}/LayerNorm_0/scale"] + a[f"{name}/LayerNorm_0/bias"], 0)
 
     def __call__(self, observation):
         """Returns the action [..., A] in [-1, 1] of an observation [..., O], or a dict with it."""

@@ -30,8 +30,8 @@ def policy_arrays(run: Run) -> dict[str, Any]:
 
     `mean`, `std` [O] and `clip` normalize; `layer0/kernel` [O, H], `layer0/bias` [H], ... are
     `layers` many, each followed by `activation`; a `cell` ("", "gru" or "lstm") with `memory_size`
-    [1 number] has its gates by Flax's names (`ir/kernel`, ...); `loc` and tanh give the action;
-    `encoders` many look at pictures by `eye0/layer0/...`, in `windows` [L, 2], kernels and strides.
+    [1 number] has its gates by Flax's names (`ir/kernel`, ...); `loc` and tanh give the action.
+    `encoders` many look at pictures, in `windows` [L, 2] of a kernel and a stride: `eye0/Dense_0`.
     `control_range` [A, 2], where the environment has a model, is what -1 and 1 stand for.
     """
     kinds = (networks.mlp, networks.recurrent, eyes.mlp, eyes.recurrent)
@@ -48,10 +48,8 @@ def policy_arrays(run: Run) -> dict[str, Any]:
     dense |= params.get("cell", {}) | {"loc": params["head"]["loc"]}
     encoders = [x for name, x in sorted(seeing.items()) if name.startswith("Convolutions_")]
     windows = np.transpose([options.eyes.kernels, options.eyes.strides]) if encoders else []
-    names = {f"Dense_{i}": f"layer{i}" for i in range(len(windows))}
-    names |= {f"Dense_{len(windows)}": "features", "LayerNorm_0": "norm"}
     for i, encoder in enumerate(encoders):
-        dense |= {f"eye{i}/{names[name]}": layer for name, layer in encoder.items()}
+        dense |= {f"eye{i}/{name}": layer for name, layer in encoder.items()}
     return _normalizer(run) | {
         "activation": options.activation,
         "layers": len(layers),
