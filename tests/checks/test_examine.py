@@ -181,7 +181,7 @@ def test_a_pixel_in_a_rollout_takes_a_byte():
     pictures = jax.ShapeDtypeStruct((8, 2, 30, 40), np.uint8)
     state = State((), pictures, *5 * [()])
     abstract = SimpleNamespace(env_state=state, episode=(), params=(), optimizer=())
-    parts = memory.least(Config(num_envs=8, rollout_length=16), abstract, 3)
+    parts = memory.least(Config(num_steps=128, num_envs=8, rollout_length=16), abstract, 3)
     assert parts["environments"] == 8 * 2 * 30 * 40
     assert parts["rollouts"] == 2 * 8 * 16 * (2 * 30 * 40 + 4 * (3 + 6))
 
