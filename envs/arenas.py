@@ -76,15 +76,23 @@ class GapsCorridor:
         """[m]."""
         return max(self.start_length, self.platform_length[1])
 
+    @property
+    def single_gap(self) -> bool:
+        """Whether the platform behind the first gap is as long as the whole corridor."""
+        return self.platform_length[0] >= self.length
+
 
 Arena = Floor | GapsCorridor | Maze | Bowl
 
 
 def check_passable(arena: Arena, body: Body) -> None:
-    """Raises if a gap can be wider than the body can cross, or a window miss what it touches."""
+    """Raises if a gap can be wider than the body can cross, or a window miss what it touches.
+
+    A single gap may be: whether the body crosses it is what is asked.
+    """
     if not isinstance(arena, GapsCorridor):
         return
-    if arena.gap_length[1] > body.longest_gap:
+    if arena.gap_length[1] > body.longest_gap and not arena.single_gap:
         raise ValueError(
             f"gap_length goes up to {arena.gap_length[1]} m, but the {body.name} is about "
             f"{body.longest_gap} m long and cannot cross a wider gap: lower gap_length."

@@ -10,7 +10,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 
 from purerl import Array, Physics, PhysicsState, State, eyes as seeing, lookup
 from purerl.envs import mazes, sight
@@ -19,7 +18,7 @@ from purerl.envs.bodies import RODENT
 from purerl.envs.compose import PREFIX, Composed, compose
 from purerl.envs.feeling import READINGS, felt
 from purerl.envs.mazes import Maze
-from purerl.envs.two_touch import distance_to_ellipsoid
+from purerl.envs.touch import touched
 
 REWARD, HEIGHT = 50.0, 0.125  # of a treat; its place above the ground [m]
 GONE = -5.0  # below the ground, where found treats are [m]
@@ -104,19 +103,9 @@ class Forage:
         fields = self.parts.boxes
         return {"geom_pos": fields.geom_pos.at[jnp.array(fields.boxes)].set(near)}
 
-    def _touched(self, readings: Any, targets: Array) -> Array:
-        """Tells which treats a part of the body touches, [M] bool."""
-        model, ids = self.parts.looks, np.array(self.touching)
-        body = model.geom_bodyid[ids]
-        turn = np.stack([seeing.rotation(quat) for quat in model.geom_quat[ids]])
-        inner = targets[:, None] - readings.xpos[body]  # [M, G, 3]
-        inner = (inner[..., None] * readings.xmat[body]).sum(-2) - model.geom_pos[ids]
-        own = (inner[..., None] * turn).sum(-2)
-        away = jax.vmap(jax.vmap(distance_to_ellipsoid), (0, None))(own, model.geom_size[ids])
-        return (away < TREAT).any(1)
-
     def _state(self, physics: PhysicsState, readings: Any, task: dict, action: Array) -> State:
-        new = self._touched(readings, task["targets"]) & ~task["found"]
+        new = touched(self.parts.looks, self.touching, readings, task["targets"], TREAT)
+        new &= ~task["found"]
         found = task["found"] | new
         torso = self.parts.torso
         away = task["targets"] - readings.xpos[torso]

@@ -36,6 +36,7 @@ from purerl.envs.arenas import (
 from purerl.envs.bodies import ANT, RODENT, Body
 from purerl.envs.compose import PREFIX, Composed, compose
 from purerl.envs.feeling import READINGS, felt
+from purerl.envs.trial import LANDED, outcome, steps_beyond
 
 BODIES = {"ant": ANT, "rodent": RODENT}
 BODY_READINGS = ("cinert", "cvel")
@@ -66,16 +67,16 @@ class Options:
 
     body: Literal["ant", "rodent"] = "ant"
     """Which of dm_control's walkers."""
-    arena: Literal["floor", "gaps"] = "floor"
-    """An endless floor, or a corridor whose gaps differ in every episode."""
+    arena: Literal["floor", "gaps", "single_gap"] = "floor"
+    """An endless floor, a corridor whose gaps differ in every episode, or a trial at one gap."""
     platform_length: tuple[float, float] = (1.5, 2.0)
-    """Gaps only: least and greatest length of a platform [m]."""
+    """Of `gaps`: least and greatest length of a platform [m]."""
     gap_length: tuple[float, float] = (0.05, 0.2)
-    """Gaps only: least and greatest length of a gap [m]."""
+    """With gaps: least and greatest length of a gap [m]."""
     corridor_width: float = 4.0
-    """Gaps only: beyond half of it on either side, the body falls [m]."""
+    """With gaps: beyond half of it on either side, the body falls [m]."""
     runway: float = 1.0
-    """Gaps only: from the start to the first gap [m]."""
+    """With gaps: from the start to the first gap [m]."""
     reward: Literal["speed", "target"] = "speed"
     """The weighted terms below, or dm_control's corridor reward: speed / target_speed in [0, 1]."""
     target_speed: float = 1.0
@@ -141,6 +142,8 @@ class Run:
         if isinstance(self.parts.arena, GapsCorridor):
             task["course"] = draw_course(course_key, self.parts.arena)
             task["crossed"] = jnp.zeros((), jnp.int32)
+            if self.parts.arena.single_gap:
+                task["beyond"] = jnp.zeros((), jnp.int32)
         if self.eyes:
             # Not of the keys above: a body without eyes draws what it always drew.
             task["eyes"] = sight.draw(jax.random.fold_in(key, 1), self.options.eyes)
@@ -199,6 +202,14 @@ class Run:
             crossed = jnp.where(stands, crossed, task["crossed"])
             metrics["gaps_crossed_count"] = (crossed - task["crossed"]).astype(jnp.float32)
             task |= {"crossed": crossed}
+        if "beyond" in task:
+            steps = round(LANDED / self.control_timestep)
+            ends = readings.xpos[jnp.array(self.parts.end_effectors)]
+            task |= {"beyond": steps_beyond(task["beyond"], ends, task["course"])}
+            finished = healthy & (task["beyond"] >= steps)
+            first = physics.time < 1.5 * self.control_timestep
+            metrics |= outcome(first, ~healthy, finished)
+            metrics["gap_length"] = task["course"][1, 0] - task["course"][0, 1]
         return State(
             physics=physics,
             observation=self._observe(physics, readings, task, action),
@@ -306,8 +317,11 @@ def build_arena(options: Options, body: Body) -> Arena:
     """Returns the arena, its window of boxes as small as the body's reach allows."""
     if options.arena == "floor":
         return Floor()
+    platform_length = options.platform_length
+    if options.arena == "single_gap":
+        platform_length = (GapsCorridor.length, GapsCorridor.length)
     corridor = GapsCorridor(
-        options.platform_length,
+        platform_length,
         options.gap_length,
         start_length=GapsCorridor.spawn_x + options.runway,
         width=options.corridor_width,

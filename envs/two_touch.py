@@ -17,6 +17,7 @@ from purerl.envs.arenas import TARGET, Floor
 from purerl.envs.bodies import RODENT
 from purerl.envs.compose import PREFIX, Composed, compose
 from purerl.envs.feeling import READINGS, felt
+from purerl.envs.touch import touched
 
 BEFORE, ONCE, TWICE, TOO_SOON, TOO_LATE = range(5)
 HEIGHT, AREA, RADIUS = 0.14, 1.5, 0.025  # of the orb: above the ground, +- from the middle [m]
@@ -77,20 +78,11 @@ class TwoTouch:
         before = state.physics.replace(mocap_pos=orb["place"][None])
         ctrl = lookup.scale_action(self.physics.model, action)
         physics, readings = self.physics.step(before, ctrl)
-        touching = self._touching(readings, orb["place"])
+        palms, place = self.palms, orb["place"]
+        (touching,) = touched(self.parts.looks, palms, readings, place[None], RADIUS)
         orb, earned = tapped(orb, touching, physics.time)
         task = task | {"key": next_key, "orb": orb}
         return self._state(physics, readings, task, earned, action)
-
-    def _touching(self, readings: Any, place: Array) -> Array:
-        """Tells whether a palm touches the orb, [] bool."""
-        model, found = self.parts.looks, []
-        for geom in self.palms:
-            body = model.geom_bodyid[geom]
-            inner = readings.xmat[body].T @ (place - readings.xpos[body])
-            own = seeing.rotation(model.geom_quat[geom]).T @ (inner - model.geom_pos[geom])
-            found.append(distance_to_ellipsoid(own, model.geom_size[geom]) < RADIUS)
-        return jnp.stack(found).any()
 
     def _state(
         self, physics: PhysicsState, readings: Any, task: dict, earned: Array, action: Array
@@ -169,29 +161,6 @@ def tapped(orb: dict[str, Array], touching: Array, time: Array) -> tuple[dict[st
         "over": after & ~orb["waits"] & (time > orb["second"]),
     }
     return orb, REWARD * (begins | right).astype(jnp.float32)
-
-
-def distance_to_ellipsoid(point: Array, radii: Any) -> Array:
-    """Returns the distance of a point [3] from an ellipsoid's surface, [], 0 inside [m].
-
-    The nearest point is x r^2 / (r^2 + t), with the t for which it is on the surface: by bisection
-    (D. Eberly, "Distance from a point to an ellipse, an ellipsoid, or a hyperellipsoid", 2013).
-    """
-    square = jnp.square(jnp.asarray(radii, jnp.float32))
-
-    def outside(t: Array) -> Array:
-        return (square * jnp.square(point / (square + t))).sum() > 1.0
-
-    def halve(_, ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = ends
-        middle = 0.5 * (low + high)
-        far = outside(middle)
-        return jnp.where(far, middle, low), jnp.where(far, high, middle)
-
-    most = jnp.sqrt(jnp.square(point).sum()) * jnp.sqrt(square.max())
-    low, _ = jax.lax.fori_loop(0, 40, halve, (jnp.zeros(()), most))
-    nearest = point * square / (square + low)
-    return jnp.where(outside(jnp.zeros(())), jnp.sqrt(jnp.square(point - nearest).sum()), 0.0)
 
 
 def build(options: Options = Options(), engine: str = "auto") -> TwoTouch:  # noqa: B008

@@ -4,7 +4,7 @@ Normalization, memory and squashing are inside the file; docs/howto/export.md sh
 The policy acts by its distribution's centre. It is played on whole episodes, and how far the file's
 actions are from the run's own is printed.
 
-    npz    arrays by name, for numpy: networks.mlp and networks.recurrent
+    npz    arrays by name, for numpy: mlp and recurrent, of networks and of eyes
     jax    a program of jax.export, for JAX on any device: any network
     onnx   a graph, operator set 17: networks of layers, cells and elementwise functions
 """

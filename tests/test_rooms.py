@@ -40,6 +40,7 @@ MAY_IMPORT = {
         "exact",
         "ppo",
         "physics",
+        "eyes",
         "machine",
         "experiment",
         "runs",

@@ -1,4 +1,4 @@
-"""Where time and memory go: physics, rollout, learner, update, evaluation of an experiment.
+"""Where time and memory go: physics, eyes, rollout, learner, update, evaluation of an experiment.
 
     python -m purerl.experiments.benchmarks.benchmark ant_run
     python -m purerl.experiments.benchmarks.benchmark ant_run --engine jax --json out.json
@@ -7,6 +7,7 @@
 Each part is compiled by itself and timed in rounds, part after part, so that a busy moment of the
 machine falls on all of them; the median of the rounds counts. Rates are control steps per second.
 "Physics alone" is the bare engine under random controls: no network, no reward, no observation.
+"Eyes" is what they see of the start, as often: neither physics nor blur or noise.
 "Busy" is the share of the time in which a GPU ran a kernel: the rest are gaps, left by the host.
 
 Memory: the run's state; one update, its state and what the compiled program needs beside it; and
@@ -43,7 +44,7 @@ from purerl.ppo import algorithm
 from purerl.ppo.evaluation import evaluate_policy
 from purerl.ppo.rollout import rollout
 
-PARTS = ("physics alone", "rollout", "learner", "update", "evaluation")
+PARTS = ("physics alone", "eyes", "rollout", "learner", "update", "evaluation")
 
 
 class Part(NamedTuple):
@@ -96,6 +97,25 @@ def bare_physics(env: Any, config: algorithm.Config, state: TrainState, key: Arr
     return jax.lax.scan(step, state.env_state.physics, jnp.arange(config.rollout_length))[0]
 
 
+def eyes_alone(env: Any, config: algorithm.Config, state: TrainState) -> Array:
+    """Looks once in each control step of a rollout; returns the last pictures [B, E, H, W]."""
+
+    def places(state: Any) -> tuple:
+        changes = env.model_changes(state) if hasattr(env, "model_changes") else {}
+        readings = env.physics.init(state.physics.qpos, state.physics.qvel, changes)[1]
+        boxes = env.scenery(state) if hasattr(env, "scenery") else None
+        return readings.xpos, readings.xmat, boxes
+
+    xpos, xmat, boxes = jax.vmap(places)(state.env_state)
+
+    def look(seen: Array, t: Array) -> tuple[Array, None]:
+        # A little farther each time, or XLA would look once.
+        return jax.vmap(env.eyes.see)(xpos + 1e-4 * t, xmat, boxes), None
+
+    first = jax.vmap(env.eyes.see)(xpos, xmat, boxes)
+    return jax.lax.scan(look, first, jnp.arange(1, config.rollout_length))[0]
+
+
 def make_bench(experiment: Experiment, names: Sequence[str] = PARTS) -> Bench:
     """Compiles the parts of an experiment on its engine."""
     config, env, network, _ = objects.build(experiment)
@@ -107,6 +127,7 @@ def make_bench(experiment: Experiment, names: Sequence[str] = PARTS) -> Bench:
     steps, episodes = config.steps_per_update, experiment.evaluation.num_episodes
     programs: list[tuple[str, Callable, tuple, int | None]] = [
         ("physics alone", partial(bare_physics, env, config), (state, key), steps),
+        ("eyes", partial(eyes_alone, env, config), (state,), steps),
         ("rollout", partial(rollout, config, env, network), (state,), steps),
         ("learner", partial(algorithm.improve, config, network), (state, seen), steps),
         ("update", partial(algorithm.update, config, env, network), (state,), steps),
@@ -123,9 +144,10 @@ def make_bench(experiment: Experiment, names: Sequence[str] = PARTS) -> Bench:
             None,
         ),
     ]
-    if not hasattr(env, "physics"):
-        programs = programs[1:]
-    parts = [compile_part(*program) for program in programs if program[0] in names]
+    absent = {"physics alone"} if not hasattr(env, "physics") else set()
+    absent |= {"eyes"} if not getattr(env, "eyes", None) else set()
+    chosen = [program for program in programs if program[0] in set(names) - absent]
+    parts = [compile_part(*program) for program in chosen]
     return Bench(parts, state, config.num_envs)
 
 

@@ -12,7 +12,7 @@ SCALARS = 6  # of a control step: reward, value, log-probability, advantage, tar
 # What takes memory, and what makes it smaller.
 CURES = {
     "environments": "ppo.num_envs",
-    "rollouts": "ppo.num_envs or ppo.rollout_length",
+    "rollouts": "ppo.num_envs, ppo.rollout_length or what is observed",
     "the network and its optimizer": "the network's widths",
 }
 

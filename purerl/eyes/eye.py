@@ -30,6 +30,9 @@ class Eye:
         """Refuses what sees nothing."""
         if not 0.0 < self.fovy < 180.0:
             raise ValueError(f"fovy is {self.fovy}; give degrees, more than 0 and less than 180.")
+        for name in ("position", "direction", "up"):
+            if np.shape(given := getattr(self, name)) != (3,) or not np.isfinite(given).all():
+                raise ValueError(f"{name} is {given}; give three finite numbers.")
         if np.linalg.norm(np.cross(self.direction, self.up)) < 1e-6:
             raise ValueError(
                 f"direction {self.direction} and up {self.up} are parallel or 0: the picture has "

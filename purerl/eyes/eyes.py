@@ -16,6 +16,7 @@ from purerl.eyes.eye import Eye, rays
 from purerl.eyes.scene import shapes_of
 from purerl.physics import lookup
 
+LARGEST = 4096  # edge of a picture [pixels]: its rays take a gigabyte while they are made
 SHADE = 0.4  # of the light, what a surface turned away from it still has
 CONTRAST = 0.4  # of the checks on what stands still, which have 1 +- this of the surface's grey
 SKY, ABYSS = 0.9, 0.0  # grey of a ray that meets nothing, upwards and downwards
@@ -49,8 +50,10 @@ class Eyes:
         if len({eye.fovy for eye in eyes}) != 1:
             said = f"The eyes have fovy {[eye.fovy for eye in eyes]}"
             raise ValueError(f"{said}: give at least one eye, and all of them the same.")
-        if min(*size, reach, check) <= 0:
-            raise ValueError(f"size is {size}, reach {reach}, check {check}; all are above 0.")
+        if np.shape(size) != (2,) or not {*size} <= {*range(1, LARGEST + 1)}:
+            raise ValueError(f"size is {size}; give (H, W), whole numbers from 1 to {LARGEST}.")
+        if not (reach > 0 and check > 0):
+            raise ValueError(f"reach is {reach} and check {check}; both are above 0.")
         self.size, self.reach, self.check = size, reach, check
         self.body = np.array([lookup.find(model, "body", eye.body) for eye in eyes])
         self.position = np.array([eye.position for eye in eyes], np.float32)

@@ -33,7 +33,7 @@ class Encoder:
         if len({*map(len, layers)}) != 1:
             said = "channels {}, kernels {} and strides {}".format(*layers)
             raise ValueError(f"{said} are of different lengths: give one of each for a layer.")
-        if min(*sum(layers, ()), self.features) < 1:
+        if min(sum(layers, (self.features,))) < 1:
             raise ValueError(f"{self} has a number below 1.")
 
 

@@ -68,5 +68,5 @@ def check_observation(observation: "PyTree") -> None:
             what = f"a {kind}" if shape is None else f"of shape {shape}"
             raise ValueError(
                 f"The observation's part {name} is {what}; this network takes arrays [O]: flatten "
-                "it, or write a network of your own (experiments/custom_network.py)."
+                "it, take eyes.mlp for pictures, or write one (experiments/custom_network.py)."
             )

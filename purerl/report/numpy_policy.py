@@ -41,11 +41,29 @@ class Policy:
         self.c = sigmoid(f) * self.c + sigmoid(i) * np.tanh(g)
         self.h = sigmoid(o) * np.tanh(self.c)
 
-    def __call__(self, observation):
-        """Returns the action [..., A] in [-1, 1] of an observation [..., O]."""
+    def _see(self, pictures):
+        """Yields the features [..., F] of each eye's pictures, of uint8 [..., E, H, W]."""
         a = self.arrays
-        x = (np.asarray(observation, np.float32) - a["mean"]) / a["std"]
+        for eye in range(pictures.shape[-3]):
+            name = f"eye{eye % a['encoders']}"
+            x = pictures[..., eye, :, :, None] / np.float32(127.5) - 1
+            for layer, (kernel, stride) in enumerate(a["windows"]):
+                x = np.lib.stride_tricks.sliding_window_view(x, (kernel, kernel), (-3, -2))
+                x = np.moveaxis(x[..., ::stride, ::stride, :, :, :], -3, -1)
+                x = x.reshape(*x.shape[:-3], -1)
+                x = np.maximum(self._dense(f"{name}/Dense_{layer}", x), 0)
+            x = self._dense(f"{name}/Dense_{len(a['windows'])}", x.reshape(*x.shape[:-3], -1))
+            x = (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-6)
+            yield np.maximum(x * a[f"{name}/LayerNorm_0/scale"] + a[f"{name}/LayerNorm_0/bias"], 0)
+
+    def __call__(self, observation):
+        """Returns the action [..., A] in [-1, 1] of an observation [..., O], or a dict with it."""
+        a = self.arrays
+        parts = observation if isinstance(observation, dict) else {"policy": observation}
+        x = (np.asarray(parts["policy"], np.float32) - a["mean"]) / a["std"]
         x = np.clip(x, -a["clip"], a["clip"])
+        if a["encoders"]:
+            x = np.concatenate([x, *self._see(np.asarray(parts["eyes"]))], -1)
         for layer in range(a["layers"]):
             x = ACTIVATIONS[str(a["activation"])](self._dense(f"layer{layer}", x))
         if a["cell"]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from purerl import eyes
 from purerl.core.errors import UserError
 from purerl.machine.files import write_arrays
 from purerl.ppo import networks, running_moments
@@ -18,11 +19,10 @@ def write_npz(run: Run, file: Path) -> Callable[[Any], np.ndarray]:
     """Writes a run's policy as npz; returns the file's policy, of observations [N, ...].
 
     Raises:
-      UserError: the network is none of `networks.mlp` and `networks.recurrent`.
+      UserError: the network is none of `networks` and `eyes`.
     """
     write_arrays(file, policy_arrays(run))
-    policy = Policy(file)
-    return lambda observation: policy(networks.policy_features(observation))
+    return Policy(file)
 
 
 def policy_arrays(run: Run) -> dict[str, Any]:
@@ -30,23 +30,31 @@ def policy_arrays(run: Run) -> dict[str, Any]:
 
     `mean`, `std` [O] and `clip` normalize; `layer0/kernel` [O, H], `layer0/bias` [H], ... are
     `layers` many, each followed by `activation`; a `cell` ("", "gru" or "lstm") with `memory_size`
-    [1 number] has its gates by Flax's names (`ir/kernel`, ...); `loc` and tanh give the action;
+    [1 number] has its gates by Flax's names (`ir/kernel`, ...); `loc` and tanh give the action.
+    `encoders` many look at pictures, in `windows` [L, 2] of a kernel and a stride: `eye0/Dense_0`.
     `control_range` [A, 2], where the environment has a model, is what -1 and 1 stand for.
     """
-    kinds = (networks.mlp, networks.recurrent)
+    kinds = (networks.mlp, networks.recurrent, eyes.mlp, eyes.recurrent)
     if run.experiment.build_network not in kinds:
         raise UserError(
-            "npz knows the layers of networks.mlp and networks.recurrent, and this run's network "
-            "is one of your own: use --format jax or --format onnx."
+            "npz knows the layers of mlp and recurrent, of networks and of eyes, and this run's "
+            "network is one of your own: use --format jax or --format onnx."
         )
-    options, params = run.experiment.network, run.state.params["params"]
+    options, seeing = run.experiment.network, run.state.params["params"]
+    params = seeing.get("network", seeing)  # behind the eyes
     cell = getattr(options, "cell", "")
     layers = params.get("encoder" if cell else "policy", {})  # Flax has none of no layers
     dense = {f"layer{i}": layers[f"Dense_{i}"] for i in range(len(layers))}
     dense |= params.get("cell", {}) | {"loc": params["head"]["loc"]}
+    encoders = [x for name, x in sorted(seeing.items()) if name.startswith("Convolutions_")]
+    windows = np.transpose([options.eyes.kernels, options.eyes.strides]) if encoders else []
+    for i, encoder in enumerate(encoders):
+        dense |= {f"eye{i}/{name}": layer for name, layer in encoder.items()}
     return _normalizer(run) | {
         "activation": options.activation,
         "layers": len(layers),
+        "encoders": len(encoders),
+        "windows": windows,
         "cell": cell,
         "memory_size": [options.hidden] if cell else [0],
         **{f"{name}/{k}": np.asarray(x) for name, layer in dense.items() for k, x in layer.items()},

@@ -13,6 +13,7 @@ import pytest
 
 from purerl.checks import check_env, examine_env, examine_network
 from purerl.checks.examine_physics import check_controls, check_model, check_placed, check_ranges
+from purerl.core.env import State
 from purerl.core.records import Network, Normal, PolicyOutput
 from purerl.devices import memory
 from purerl.devices.programs import abstract_state
@@ -173,6 +174,16 @@ def test_memory_is_compared_with_what_there_is(room, level, monkeypatch):
     found = examine.check_memory(setup, abstract)
     assert found.level == level
     assert level == "ok" or "lower" in found.text
+
+
+def test_a_pixel_in_a_rollout_takes_a_byte():
+    """Twice: as it was collected, and shuffled; beside an action and six numbers of float32."""
+    pictures = jax.ShapeDtypeStruct((8, 2, 30, 40), np.uint8)
+    state = State((), pictures, *5 * [()])
+    abstract = SimpleNamespace(env_state=state, episode=(), params=(), optimizer=())
+    parts = memory.least(Config(num_steps=128, num_envs=8, rollout_length=16), abstract, 3)
+    assert parts["environments"] == 8 * 2 * 30 * 40
+    assert parts["rollouts"] == 2 * 8 * 16 * (2 * 30 * 40 + 4 * (3 + 6))
 
 
 @pytest.mark.parametrize(("number", "level"), [(1, "ok"), (2, "warning")])

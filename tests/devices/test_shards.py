@@ -24,10 +24,9 @@ from purerl.runs import checkpoint_folder
 from tests.runs import toy_experiment
 from tests.training.test_run import ROOT, TOY
 
-CARTPOLE = [str(ROOT / "experiments" / "cartpole_swingup.py"), "--ppo.num-envs", "16"]
-CARTPOLE += ["--ppo.rollout-length", "8", "--ppo.num-steps", "512", "--ppo.num-minibatches", "2"]
-CARTPOLE += ["--evaluation.number", "1", "--evaluation.num-episodes", "2"]
-CARTPOLE += ["--ppo.episode-length", "12"]
+SMALL = ["--ppo.num-envs", "16", "--ppo.rollout-length", "8", "--ppo.num-steps", "512"]
+SMALL += ["--ppo.num-minibatches", "2", "--ppo.episode-length", "12"]
+SMALL += ["--evaluation.num-episodes", "2"]
 SHARDED = [str(TOY), "--ppo.num-envs", "16", "--num-shards", "4", "--checkpoints", "3"]
 # LLVM does less, in three quarters of the time. What a number of devices changes is done before, by
 # XLA's passes, which remain (XLA's older loops, of `quick.OPTIONS`, are not equal).
@@ -87,16 +86,21 @@ def toy(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["c", "jax"])
-def test_physics_is_the_same_on_any_number_of_devices(tmp_path, engine):
-    words = [*CARTPOLE, "--engine", engine, "--num-shards", "4"]
+@pytest.mark.parametrize(
+    ("engine", "experiment", "told"),
+    [("c", "experiments/cartpole_swingup.py --evaluation.number 1", "eval/episode_return"),
+     ("jax", "tests/golden/seeing.py --evaluation.number 0", "train/episode_return")],
+)  # fmt: skip
+def test_physics_is_the_same_on_any_number_of_devices(tmp_path, engine, experiment, told):
+    """With eyes and a memory, too, but for their evaluation."""
+    words = [*experiment.split(), *SMALL, "--engine", engine, "--num-shards", "4"]
     for devices in (1, 2):
         start(tmp_path, devices, *words, "--name", str(devices), flags=QUICKLY)
     if engine == "jax":  # which puts its model on a device: in two processes, each on its own
         both_end(start_two(tmp_path, *words, "--name", "apart", flags=QUICKLY), SUCCESS)
-    one, *others = (lines(folder) for folder in sorted((tmp_path / "cartpole_swingup").iterdir()))
+    one, *others = (lines(folder) for folder in sorted(tmp_path.glob("*/*")))
     assert len(others) == (2 if engine == "jax" else 1) and all(other == one for other in others)
-    assert one[-1]["train/reward"] > 0 and one[-1]["eval/episode_return"] > 0
+    assert one[-1]["train/reward"] > 0 and one[-1][told] > 0
 
 
 @pytest.mark.slow

@@ -231,6 +231,38 @@ def test_a_body_that_may_climb_out_of_a_gap_has_crossed_it_when_it_stands():
     assert fallen.terminated and fallen.metrics["gaps_crossed_count"] == 0
 
 
+def test_a_trial_at_one_gap_ends_landed_fallen_or_stopped():
+    """Each is 1 in its own episode, summed over its steps; a gap may be too wide to cross."""
+    env = run.build(run.Options(arena="single_gap", gap_length=(1.5, 1.5)), "c")
+    assert env.parts.arena.boxes == 2
+    told = jax.eval_shape(run.build(run.Options(arena="gaps"), "c").reset, jax.random.key(0))
+    start, step = env.reset(jax.random.key(0)), quick.jit(env.step)
+    assert start.observation.shape == told.observation.shape
+
+    def trial(*places):
+        """Puts the torso at (x, z) [m], or leaves it, step by step; returns sums and the end."""
+        state, total = start, np.zeros(3)
+        for place in places:
+            if place:
+                qpos = start.physics.qpos.at[jnp.array([0, 2])].set(jnp.array(place))
+                rest = jnp.zeros_like(start.physics.qvel)
+                state = state.replace(physics=state.physics.replace(qpos=qpos, qvel=rest))
+            state = step(state, jnp.zeros(8))
+            names = ("landed_count", "fell_count", "stopped_count")
+            total += [float(state.metrics[name]) for name in names]
+        return total.tolist(), bool(state.truncated), bool(state.terminated), state.metrics
+
+    edge, held = 6.0 + 1.5, [None] * 7  # of 0.025 s each
+    *landed, metrics = trial(None, (edge + 1.5, 0.522), *held)
+    assert landed == [[1, 0, 0], True, False] and float(metrics["gap_length"]) == 1.5
+    assert trial((edge + 1.5, 0.522), *held[1:])[:3] == ([0, 0, 1], False, False)  # too short
+    # A foot hangs over the gap; below the ground; back over the gap for a step in between.
+    assert trial((edge + 0.1, 0.522), *held)[0][0] == 0
+    assert trial((edge + 1.5, -0.6))[:3] == ([0, 1, 0], False, True)
+    assert trial(*[(edge + 1.5, 0.522)] * 7, (5.0, 0.522), (edge + 1.5, 0.522))[0] == [0, 0, 1]
+    assert trial(None, None)[0] == [0, 0, 1]
+
+
 @pytest.mark.parametrize(
     "lengths", [{"platform_length": (1.5, 1.5), "gap_length": (0.2, 0.2)}, {"runway": 34.0}]
 )

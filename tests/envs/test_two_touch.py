@@ -11,7 +11,8 @@ from dm_control.locomotion.props.target_sphere import TargetSphereTwoTouch
 from dm_control.locomotion.tasks import reach
 
 from purerl.envs import sight, two_touch
-from purerl.envs.two_touch import distance_to_ellipsoid, new_orb, tapped
+from purerl.envs.touch import distance_to_ellipsoid
+from purerl.envs.two_touch import new_orb, tapped
 
 DT = 0.021  # no number of steps is 0.2, 0.7, 0.9 or 1.2 s: there rounding would decide
 

@@ -10,6 +10,7 @@ import purerl
 from purerl import __main__ as commands, run
 from purerl.core.errors import SUCCESS
 from purerl.report.policy_file import record_episodes
+from purerl.report.policy_npz import write_npz
 from purerl.report.policy_onnx import write_onnx
 from tests.docs.blocks import ROOT, blocks
 
@@ -59,6 +60,7 @@ def test_the_policy_can_be_taken_away_with_its_eyes(seeker, tmp_path):
     trained = purerl.load(seeker / "seeker" / "seed1")
     recorded = record_episodes(trained, seed=1)
     assert recorded.observation["eyes"].dtype == np.uint8
+    assert recorded.difference(write_npz(trained, tmp_path / "p.npz")) < 1e-5
     assert recorded.difference(write_onnx(trained, tmp_path / "p.onnx")) < 1e-5
     words = ["export", str(trained.folder), "--format", "jax"]
     assert commands.main([*words, "--out", str(tmp_path / "policy.jax")]) == SUCCESS

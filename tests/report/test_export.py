@@ -202,7 +202,7 @@ READER = Path(str(numpy_policy.__file__)).read_text()
 def test_the_reader_is_short_and_needs_numpy_alone():
     assert re.findall(r"^(?:import|from) (.*)$", READER, re.MULTILINE) == ["numpy as np"]
     code = [line for line in READER.splitlines() if line and not line.strip().startswith('"""')]
-    assert len(code) <= 40
+    assert len(code) <= 55
 
 
 @pytest.mark.slow
