@@ -7,7 +7,7 @@ import dataclasses
 
 from purerl import Evaluation, Experiment, eyes
 from purerl.envs import maze_forage, sight
-from purerl.experiments import rodent_gaps
+from purerl.experiments import rodent_run
 
 experiment = Experiment(
     build_env=maze_forage.build,
@@ -15,18 +15,12 @@ experiment = Experiment(
     env=maze_forage.Options(eyes=sight.Sight(number=2), forward_weight=0.5),
     build_network=eyes.recurrent,
     network=eyes.RecurrentOptions(
-        encoder=(256,),
-        hidden=128,
-        value_hidden=(256,),
-        std="state",
-        initial_std=0.3,
-        min_std=1e-3,
+        encoder=(256,), hidden=128, value_hidden=(256,), initial_std=0.3, min_std=1e-3
     ),
     ppo=dataclasses.replace(
-        rodent_gaps.experiment.ppo,
-        num_steps=16_000_000,
+        rodent_run.experiment.ppo,
+        num_steps=6_000_000,
         episode_length=1500,  # 30 s
-        reward_scale=0.1,
     ),
     evaluation=Evaluation(num_episodes=32, number=8),
 )

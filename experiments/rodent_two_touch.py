@@ -1,31 +1,25 @@
 """dm_control's rodent taps an orb, waits 0.8 s, and taps it again: it needs a memory.
 
-python -m purerl.run rodent_two_touch --engine warp
+python -m purerl.run rodent_two_touch
 """
 
 import dataclasses
 
 from purerl import Evaluation, Experiment, networks
 from purerl.envs import sight, two_touch
-from purerl.experiments import rodent_gaps
+from purerl.experiments import rodent_run
 
 experiment = Experiment(
     build_env=two_touch.build,
     env=two_touch.Options(eyes=sight.Sight(number=0), area=0.3),
     build_network=networks.recurrent,
     network=networks.RecurrentOptions(
-        encoder=(256,),
-        hidden=128,
-        value_hidden=(256,),
-        std="state",
-        initial_std=0.3,
-        min_std=1e-3,
+        encoder=(256,), hidden=128, value_hidden=(256,), initial_std=0.3, min_std=1e-3
     ),
     ppo=dataclasses.replace(
-        rodent_gaps.experiment.ppo,
-        num_steps=16_000_000,
+        rodent_run.experiment.ppo,
+        num_steps=6_000_000,
         episode_length=1500,  # 30 s
-        reward_scale=0.1,
     ),
     evaluation=Evaluation(num_episodes=32, number=8),
 )
