@@ -9,15 +9,17 @@ The letters: o [3] the origin, d three arrays [...] the directions, in the scale
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from purerl.core.records import Array
+from purerl.eyes.fields import enter_field, normal_of_field
 
 _GEOM = mujoco.mjtGeom
+FIELD = _GEOM.mjGEOM_HFIELD
 Vector = Sequence[Array]  # x, y and z
 UP = np.array([0.0, 0.0, 1.0], np.float32)
 
@@ -26,8 +28,8 @@ class Kind(NamedTuple):
     """A kind of shape."""
 
     scale: Callable[[np.ndarray], np.ndarray]  # geom_size [3] -> [3] to divide by [m]
-    enter: Callable[[Vector, Vector, Array], Array]  # o, d, length [] -> t [...]
-    normal: Callable[[Array, Array], Array]  # point [..., 3], length [...] -> [..., 3], any length
+    enter: Callable[[Vector, Vector, Any], Array]  # o, d, length [] -> t [...]
+    normal: Callable[[Array, Any], Array]  # point [..., 3], length [...] -> [..., 3], any length
 
 
 def _dot(x: Vector, y: Vector) -> Array:
@@ -109,6 +111,7 @@ def _normal_of_plane(p: Array, length: Array) -> Array:
 # In this order shapes stand in a scene. Boxes are last: those of an episode follow the model's.
 KINDS = {
     _GEOM.mjGEOM_PLANE: Kind(np.ones_like, _enter_plane, _normal_of_plane),
+    FIELD: Kind(lambda s: s, enter_field, normal_of_field),  # heights in place of a length
     _GEOM.mjGEOM_SPHERE: Kind(lambda s: s[[0, 0, 0]], _enter_ball, _normal_of_ball),
     _GEOM.mjGEOM_ELLIPSOID: Kind(lambda s: s, _enter_ball, _normal_of_ball),
     _GEOM.mjGEOM_CAPSULE: Kind(lambda s: s[[0, 0, 0]], _enter_capsule, _normal_of_capsule),
