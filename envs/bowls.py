@@ -74,8 +74,11 @@ def coefficients(bowl: Bowl, bumps: Array) -> Array:
 
 
 def heights(bowl: Bowl, terrain: Array) -> Array:
-    """Returns all heights of the terrain [G, G], rows along y [m], from coefficients [B, B]."""
-    return jnp.float32(tables(bowl).shape) * _both_ways(tables(bowl).spline, terrain) - bowl.depth
+    """Returns all heights of the terrain above its lowest point, [G, G], rows along y [m].
+
+    `terrain` is its coefficients [B, B].
+    """
+    return jnp.float32(tables(bowl).shape) * _both_ways(tables(bowl).spline, terrain)
 
 
 def _both_ways(matrix: np.ndarray, x: Array) -> Array:
