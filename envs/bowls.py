@@ -90,7 +90,7 @@ def _both_ways(matrix: np.ndarray, x: Array) -> Array:
 def ground(bowl: Bowl, terrain: Array, place: Array) -> tuple[Array, Array]:
     """Returns how high the ground is at places, [K] [m], and its normals there, [K, 3].
 
-    Of the triangles that MuJoCo makes of a height field, or of the plane z = 0 where that is higher.
+    Of MuJoCo's triangles of a height field, or of the plane z = 0 where that is higher.
 
     Args:
       bowl: its sizes.

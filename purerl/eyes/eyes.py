@@ -16,6 +16,8 @@ from purerl.eyes.eye import Eye, rays
 from purerl.eyes.scene import shapes_of
 from purerl.physics import lookup
 
+Boxes = casting.Boxes | None
+Heights = Array | None
 SHADE = 0.4  # of the light, what a surface turned away from it still has
 CONTRAST = 0.4  # of the checks on what stands still, which have 1 +- this of the surface's grey
 SKY, ABYSS = 0.9, 0.0  # grey of a ray that meets nothing, upwards and downwards
@@ -59,13 +61,7 @@ class Eyes:
         self.stretch = np.sqrt(1.0 + np.square(self.rays).sum(0))  # a ray's length, 1 m ahead
         self.shapes = shapes_of(model, hide)
 
-    def see(
-        self,
-        xpos: Array,
-        xmat: Array,
-        boxes: casting.Boxes | None = None,
-        heights: Array | None = None,
-    ) -> Array:
+    def see(self, xpos: Array, xmat: Array, boxes: Boxes = None, heights: Heights = None) -> Array:
         """Returns grey pictures, [E, H, W] uint8, upper row first.
 
         Args:
@@ -81,32 +77,23 @@ class Eyes:
         return self._each(self._picture, xpos, xmat, boxes, heights)
 
     def distance(
-        self,
-        xpos: Array,
-        xmat: Array,
-        boxes: casting.Boxes | None = None,
-        heights: Array | None = None,
+        self, xpos: Array, xmat: Array, boxes: Boxes = None, heights: Heights = None
     ) -> Array:
         """Returns how far what is seen is along each ray [m], [E, H, W]; inf: nothing there."""
         return self._each(lambda t, *_: t * self.stretch, xpos, xmat, boxes, heights)
 
     def _each(
-        self,
-        answer: Callable[..., Array],
-        xpos: Array,
-        xmat: Array,
-        boxes: casting.Boxes | None,
-        heights: Array | None,
+        self, answer: Callable[..., Array], xpos: Array, xmat: Array, boxes: Boxes, heights: Heights
     ) -> Array:
         """Returns what `answer` makes of each eye's entries, [E, H, W]."""
-        boxes, shapes = boxes or (jnp.zeros((0, 3)), jnp.zeros((0, 3))), self.shapes
-        if heights is not None:
-            if heights.shape != shapes.heights.shape:
-                raise ValueError(
-                    f"heights are {heights.shape}, those of the model's height field "
-                    f"{shapes.heights.shape}: give [nrow, ncol] of a field that is seen."
-                )
-            shapes = shapes._replace(heights=heights)
+        boxes = boxes or (jnp.zeros((0, 3)), jnp.zeros((0, 3)))
+        heights = self.shapes.heights if heights is None else heights
+        if heights.shape != self.shapes.heights.shape:
+            raise ValueError(
+                f"heights are {heights.shape}, those of the model's height field "
+                f"{self.shapes.heights.shape}: give [nrow, ncol] of a field that is seen."
+            )
+        shapes = self.shapes._replace(heights=heights)
         if not len(self.shapes.kind) + len(boxes[0]):
             raise ValueError("There is nothing to see: every geom is hidden, and no box is given.")
         turn = xmat[self.body]

@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 
 from purerl.core.errors import unknown_name
-from purerl.eyes.eye import rotation
 from purerl.core.records import Array
+from purerl.eyes.eye import rotation
 from purerl.eyes.shapes import FIELD, KINDS
 from purerl.physics import lookup
 
@@ -45,7 +45,7 @@ def shapes_of(model: mujoco.MjModel, hide: Sequence[str] = ()) -> Shapes:
     size, heights = model.geom_size.copy(), np.zeros((0, 0))
     fields = seen[model.geom_type[seen] == FIELD]
     if len(fields) > 1:
-        raise ValueError(f"Eyes see one height field, and there are {len(fields)}: `hide` the rest.")
+        raise ValueError(f"Eyes see one height field, and {len(fields)} are here: `hide` others.")
     for geom in fields:
         field = model.hfield(model.geom_dataid[geom])
         heights, size[geom] = field.data * field.size[2], field.size[[0, 1, 3]]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from purerl import eyes
-from purerl.eyes import fields
+from purerl.eyes import shapes
 from purerl.eyes.eyes import ABYSS, CONTRAST, SHADE, SKY
 from tests import quick
 
@@ -106,8 +106,7 @@ def test_all_together_the_nearest_is_seen_and_what_is_behind_costs_nothing():
     model = model_of(*moved)
     sight = eyes.Eyes(model, [EYE], (24, 24), reach=5.0)
     data, xpos, xmat = places(model, [1.2, 0.3, 0.5], [0, 0, 0])
-    found = distance(sight, xpos, xmat, jit=quick.jit)[0]
-    right = rays_of_mujoco(model, data, EYE, 24)
+    found, right = distance(sight, xpos, xmat)[0], rays_of_mujoco(model, data, EYE, 24)
     both = np.isfinite(found) & np.isfinite(right)
     assert both.mean() > 0.5
     np.testing.assert_allclose(found[both], right[both], rtol=1e-4)
@@ -156,7 +155,7 @@ def test_heights_of_an_episode_stand_for_those_of_the_model():
 def test_a_normal_of_a_field_is_that_of_its_triangle():
     random = np.random.default_rng(0)
     heights, point = random.uniform(size=(4, 6)), random.uniform(-1, 1, (50, 3))
-    normals = fields.normal_of_field(jnp.float32(point), jnp.float32(heights))
+    normals = shapes._normal_of_field(jnp.float32(point), jnp.float32(heights))
     for (x, y, _), normal in zip(point, np.asarray(normals), strict=True):
         column, row = int(2.5 * (x + 1)), int(1.5 * (y + 1))
         right = 2.5 * (x + 1) - column > 1.5 * (y + 1) - row
@@ -262,7 +261,7 @@ def test_a_camera_of_the_model_is_an_eye():
         (lambda: eyes.Eyes(mesh(), [EYE]), "do not see a mesh, and geom 'stone' is one"),
         (
             lambda: eyes.Eyes(model_of(*2 * [KINDS["field"].replace('name="hill" ', "")]), [EYE]),
-            "Eyes see one height field, and there are 2: `hide` the rest",
+            "Eyes see one height field, and 2 are here: `hide` others",
         ),
         (
             lambda: eyes.Eyes(model_of(KINDS["field"]), [EYE]).see(
