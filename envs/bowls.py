@@ -139,9 +139,9 @@ def columns(bowl: Bowl, terrain: Array, place: Array) -> tuple[Array, Array]:
     fine, coarse = bowl.cell / 2, 5 * bowl.cell
     near = jnp.round(place / fine) * fine + _grid(15, fine)
     far = _grid(round(bowl.half / coarse), coarse)
-    around = far[:, None] + _grid(1, coarse / 2)
-    low = ground(bowl, terrain, around.reshape(-1, 2))[0].reshape(len(far), -1).min(1)
-    top = jnp.concatenate([ground(bowl, terrain, near)[0], low])
+    high = heights(bowl, terrain) - bowl.depth
+    low = jax.lax.reduce_window(high, jnp.inf, jnp.minimum, (6, 6), (5, 5), "valid")
+    top = jnp.concatenate([ground(bowl, terrain, near)[0], jnp.maximum(low.ravel(), 0.0)])
     half = jnp.concatenate([jnp.full(len(near), fine / 2), jnp.full(len(far), coarse / 2)])
     bottom = -bowl.depth
     center = jnp.concatenate([jnp.concatenate([near, far]), (top + bottom)[:, None] / 2], axis=1)

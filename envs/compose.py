@@ -151,8 +151,7 @@ def with_planes(root: mjcf.RootElement, model: mujoco.MjModel, body: Body) -> mu
     """Returns a bowl's model with planes for its terrain, one for each geom that can touch it.
 
     A geom alone meets its own, which is clear, and lies anywhere until an environment says where
-    the ground beneath that geom is. A pair's friction, solref and so on are MuJoCo's own mix of
-    the two: a plane has those of any ground.
+    the ground beneath that geom is.
     """
     root.find("geom", TERRAIN).remove()
     root.find("hfield", TERRAIN).remove()
@@ -163,7 +162,19 @@ def with_planes(root: mjcf.RootElement, model: mujoco.MjModel, body: Body) -> mu
             "geom", name=f"{GROUND}_{number}", type="plane", size=[1, 1, 1], rgba=[0, 0, 0, 0]
         )
         root.contact.add("pair", geom1=plane, geom2=root.find("geom", name))
-    return mjcf.Physics.from_mjcf_model(root).model.ptr
+    model = mjcf.Physics.from_mjcf_model(root).model.ptr
+    mix_pairs(model)
+    return model
+
+
+def mix_pairs(model: mujoco.MjModel) -> None:
+    """Gives each pair what a contact of its geoms has without it: the compiler leaves defaults."""
+    sides = np.stack([model.pair_geom1, model.pair_geom2])
+    share = (model.geom_solmix[sides] / model.geom_solmix[sides].sum(0))[..., None]
+    model.pair_dim[:] = model.geom_condim[sides].max(0)
+    model.pair_friction[:] = model.geom_friction[sides].max(0)[:, [0, 0, 1, 2, 2]]
+    model.pair_solref[:] = (share * model.geom_solref[sides]).sum(0)
+    model.pair_solimp[:] = (share * model.geom_solimp[sides]).sum(0)
 
 
 # Changes to the compiled model.
