@@ -74,8 +74,11 @@ def coefficients(bowl: Bowl, bumps: Array) -> Array:
 
 
 def heights(bowl: Bowl, terrain: Array) -> Array:
-    """Returns all heights of the terrain [G, G], rows along y [m], from coefficients [B, B]."""
-    return jnp.float32(tables(bowl).shape) * _both_ways(tables(bowl).spline, terrain) - bowl.depth
+    """Returns all heights of the terrain above its lowest point, [G, G], rows along y [m].
+
+    `terrain` is its coefficients [B, B].
+    """
+    return jnp.float32(tables(bowl).shape) * _both_ways(tables(bowl).spline, terrain)
 
 
 def _both_ways(matrix: np.ndarray, x: Array) -> Array:
@@ -87,7 +90,7 @@ def _both_ways(matrix: np.ndarray, x: Array) -> Array:
 def ground(bowl: Bowl, terrain: Array, place: Array) -> tuple[Array, Array]:
     """Returns how high the ground is at places, [K] [m], and its normals there, [K, 3].
 
-    Of the triangles that MuJoCo makes of a height field, or of the plane z = 0 where that is higher.
+    Of MuJoCo's triangles of a height field, or of the plane z = 0 where that is higher.
 
     Args:
       bowl: its sizes.
@@ -136,9 +139,9 @@ def columns(bowl: Bowl, terrain: Array, place: Array) -> tuple[Array, Array]:
     fine, coarse = bowl.cell / 2, 5 * bowl.cell
     near = jnp.round(place / fine) * fine + _grid(15, fine)
     far = _grid(round(bowl.half / coarse), coarse)
-    around = far[:, None] + _grid(1, coarse / 2)
-    low = ground(bowl, terrain, around.reshape(-1, 2))[0].reshape(len(far), -1).min(1)
-    top = jnp.concatenate([ground(bowl, terrain, near)[0], low])
+    high = heights(bowl, terrain) - bowl.depth
+    low = jax.lax.reduce_window(high, jnp.inf, jnp.minimum, (6, 6), (5, 5), "valid")
+    top = jnp.concatenate([ground(bowl, terrain, near)[0], jnp.maximum(low.ravel(), 0.0)])
     half = jnp.concatenate([jnp.full(len(near), fine / 2), jnp.full(len(far), coarse / 2)])
     bottom = -bowl.depth
     center = jnp.concatenate([jnp.concatenate([near, far]), (top + bottom)[:, None] / 2], axis=1)

@@ -17,6 +17,7 @@ from purerl import choose_engine, lookup
 from purerl.envs.arenas import (
     GROUND,
     TARGET,
+    TERRAIN,
     Arena,
     BoxFields,
     box_fields,
@@ -82,14 +83,12 @@ def compose(
     keep_sensors(walker, sensors)
     add_torso_velocity(walker, body)
     attach(root, walker, body, getattr(arena, "spawn_x", 0.0))
-    if isinstance(arena, Bowl):
-        add_planes(root, body)
     model = mjcf.Physics.from_mjcf_model(root).model.ptr
     looks = copy.copy(model)
+    if isinstance(arena, Bowl):
+        model = with_planes(root, model, body)
     mask_contacts(model, body, self_collision)
     round_ellipsoids(model)
-    if isinstance(arena, Bowl):
-        leave_pairs(model)
     free_boxes(model)
     set_solver(model, body, choose_engine(engine), timestep or body.timestep)
     check_contacts(model, body)
@@ -148,13 +147,14 @@ def attach(root: mjcf.RootElement, walker: mjcf.RootElement, body: Body, x: floa
     frame.add("freejoint")
 
 
-def add_planes(root: mjcf.RootElement, body: Body) -> None:
-    """Adds a clear plane for each geom that can touch the ground, which it alone meets.
+def with_planes(root: mjcf.RootElement, model: mujoco.MjModel, body: Body) -> mujoco.MjModel:
+    """Returns a bowl's model with planes for its terrain, one for each geom that can touch it.
 
-    They lie anywhere until an environment says where the ground beneath each geom is. A pair's
-    friction, solref and so on are MuJoCo's own mix of both.
+    A geom alone meets its own, which is clear, and lies anywhere until an environment says where
+    the ground beneath that geom is.
     """
-    model = mjcf.Physics.from_mjcf_model(root).model.ptr
+    root.find("geom", TERRAIN).remove()
+    root.find("hfield", TERRAIN).remove()
     names = [n for n in lookup.names(model, "geom") if n.startswith(PREFIX)]
     touching = [n for n in names if _touches_ground(model, n, body)]
     for number, name in enumerate(touching):
@@ -162,6 +162,19 @@ def add_planes(root: mjcf.RootElement, body: Body) -> None:
             "geom", name=f"{GROUND}_{number}", type="plane", size=[1, 1, 1], rgba=[0, 0, 0, 0]
         )
         root.contact.add("pair", geom1=plane, geom2=root.find("geom", name))
+    model = mjcf.Physics.from_mjcf_model(root).model.ptr
+    mix_pairs(model)
+    return model
+
+
+def mix_pairs(model: mujoco.MjModel) -> None:
+    """Gives each pair what a contact of its geoms has without it: the compiler leaves defaults."""
+    sides = np.stack([model.pair_geom1, model.pair_geom2])
+    share = (model.geom_solmix[sides] / model.geom_solmix[sides].sum(0))[..., None]
+    model.pair_dim[:] = model.geom_condim[sides].max(0)
+    model.pair_friction[:] = model.geom_friction[sides].max(0)[:, [0, 0, 1, 2, 2]]
+    model.pair_solref[:] = (share * model.geom_solref[sides]).sum(0)
+    model.pair_solimp[:] = (share * model.geom_solimp[sides]).sum(0)
 
 
 # Changes to the compiled model.
@@ -180,19 +193,14 @@ def mask_contacts(model: mujoco.MjModel, body: Body, self_collision: bool) -> No
         model.geom_contype[i] = 0 if ground else int(chosen)
         # As shipped, a geom with conaffinity 0 touches the ground and not its own kind.
         own = int(chosen and self_collision and model.geom_conaffinity[i] > 0)
-        model.geom_conaffinity[i] = 1 if ground else own
+        # Where there are pairs, as in a bowl, they alone say what touches the ground.
+        model.geom_conaffinity[i] = int(not model.npair) if ground else own
 
 
 def _touches_ground(model: mujoco.MjModel, name: str, body: Body) -> bool:
     if body.ground_geoms:
         return name.removeprefix(PREFIX) in body.ground_geoms
     return bool(model.geom(name).contype[0] > 0)
-
-
-def leave_pairs(model: mujoco.MjModel) -> None:
-    """Leaves a bowl's ground no contacts but those of pairs, of each geom with its own plane."""
-    ground = [i for i, n in enumerate(lookup.names(model, "geom")) if not n.startswith(PREFIX)]
-    model.geom_conaffinity[ground] = 0
 
 
 def round_ellipsoids(model: mujoco.MjModel) -> None:

@@ -15,10 +15,11 @@ import numpy as np
 
 from purerl.core.records import Array
 from purerl.eyes.scene import Shapes
-from purerl.eyes.shapes import KINDS, Kind
+from purerl.eyes.shapes import FIELD, KINDS
 
 LIGHT = np.array([0.3, 0.2, 0.93], np.float32)  # where light comes from, a unit vector
 BOX_GREY = 0.5  # of an episode's boxes
+FIELD_KIND = list(KINDS).index(FIELD)
 Boxes = tuple[Array, Array]  # centers and half sizes, [P, 3] each [m]
 
 
@@ -37,6 +38,7 @@ class Seen(NamedTuple):
     radius: Array  # [S] [m]
     grey: Array  # [S]
     checked: Array  # [S] bool: stands still, so it has checks
+    heights: Array  # [R, C] of the height field, scaled
 
 
 def before_eye(
@@ -75,6 +77,7 @@ def before_eye(
         radius=both(shapes.radius, jnp.sqrt(jnp.square(boxes[1]).sum(1))),
         grey=both(shapes.grey, BOX_GREY),
         checked=both(shapes.body == 0, True),
+        heights=jnp.asarray(shapes.heights) / shapes.scale[shapes.kind == FIELD_KIND, 2:],
     )
 
 
@@ -91,30 +94,32 @@ def in_view(seen: Seen, rays: np.ndarray, reach: float) -> Array:
     return visible
 
 
-def nearest(seen: Seen, visible: Array, rays: np.ndarray) -> tuple[Array, Array]:
+def nearest(seen: Seen, visible: Array, rays: np.ndarray, reach: float) -> tuple[Array, Array]:
     """Returns where each ray enters its first shape, [N] in lengths of the ray, and which that is.
 
     Args:
       seen: S shapes.
       visible: [S] bool: which to try.
       rays: [2, N].
+      reach: how far anything is looked for [m]; where nothing is, more than that is returned.
     """
-    found = jnp.full_like(rays[0], jnp.inf), jnp.zeros_like(rays[0], jnp.int32)
-    for k, kind in enumerate(KINDS.values()):
+    found = jnp.full_like(rays[0], 2.0 * reach), jnp.zeros_like(rays[0], jnp.int32)
+    for k, kind in enumerate(KINDS):
         if k in seen.kind:
             found = _nearest_of(kind, visible & (seen.kind == k), seen, rays, found)
     return found
 
 
 def _nearest_of(
-    kind: Kind, todo: Array, seen: Seen, rays: np.ndarray, found: tuple[Array, Array]
+    kind: mujoco.mjtGeom, todo: Array, seen: Seen, rays: np.ndarray, found: tuple[Array, Array]
 ) -> tuple[Array, Array]:
     """Tries the shapes of one kind that are to do, [S] bool, one after another, by number."""
 
     def try_one(carry: tuple) -> tuple:
         todo, t, which = carry
         i = jnp.argmax(todo).astype(jnp.int32)
-        entry = kind.enter([*seen.origin[i]], along(seen.turn[i], rays), seen.length[i])
+        form = (seen.heights, t) if kind == FIELD else seen.length[i]
+        entry = KINDS[kind].enter([*seen.origin[i]], along(seen.turn[i], rays), form)
         nearer = entry < t
         left = todo & (jnp.arange(todo.shape[0]) != i)
         return left, jnp.where(nearer, entry, t), jnp.where(nearer, i, which)
@@ -134,9 +139,10 @@ def lit(t: Array, which: Array, seen: Seen, rays: np.ndarray) -> tuple[Array, Ar
     scale, length, kind = seen.scale[which], seen.length[which], jnp.asarray(seen.kind)[which]
     ray = jnp.stack(along(seen.turn[which], rays), axis=1)
     normal = point = seen.origin[which] + t[:, None] * ray
-    for k, one in enumerate(KINDS.values()):
+    for k, one in enumerate(KINDS):
         if k in seen.kind:
-            normal = jnp.where((kind == k)[:, None], one.normal(point, length), normal)
+            form = seen.heights if one == FIELD else length
+            normal = jnp.where((kind == k)[:, None], KINDS[one].normal(point, form), normal)
     normal, ray = _unit(normal / scale), _unit(ray * scale)  # no longer scaled
     light = jnp.maximum((normal * seen.light[which]).sum(-1), 0.0)
     return light, jnp.abs((normal * ray).sum(-1))

@@ -17,6 +17,8 @@ from purerl.eyes.scene import shapes_of
 from purerl.physics import lookup
 
 LARGEST = 4096  # edge of a picture [pixels]: its rays take a gigabyte while they are made
+Boxes = casting.Boxes | None
+Heights = Array | None
 SHADE = 0.4  # of the light, what a surface turned away from it still has
 CONTRAST = 0.4  # of the checks on what stands still, which have 1 +- this of the surface's grey
 SKY, ABYSS = 0.9, 0.0  # grey of a ray that meets nothing, upwards and downwards
@@ -62,33 +64,47 @@ class Eyes:
         self.stretch = np.sqrt(1.0 + np.square(self.rays).sum(0))  # a ray's length, 1 m ahead
         self.shapes = shapes_of(model, hide)
 
-    def see(self, xpos: Array, xmat: Array, boxes: casting.Boxes | None = None) -> Array:
+    def see(self, xpos: Array, xmat: Array, boxes: Boxes = None, heights: Heights = None) -> Array:
         """Returns grey pictures, [E, H, W] uint8, upper row first.
 
         Args:
           xpos: a reading, of the model's bodies [nbody, 3], in metres.
           xmat: a reading, their axes [nbody, 3, 3].
           boxes: what stands around in this episode: centers and half sizes [P, 3], in metres.
-        """
-        return self._each(self._picture, xpos, xmat, boxes)
+          heights: in this episode, of the model's height field, above its geom, rows along y
+            [nrow, ncol], in metres; None: the model's own.
 
-    def distance(self, xpos: Array, xmat: Array, boxes: casting.Boxes | None = None) -> Array:
+        Raises:
+          ValueError: there is nothing to see, or no field of such heights.
+        """
+        return self._each(self._picture, xpos, xmat, boxes, heights)
+
+    def distance(
+        self, xpos: Array, xmat: Array, boxes: Boxes = None, heights: Heights = None
+    ) -> Array:
         """Returns how far what is seen is along each ray [m], [E, H, W]; inf: nothing there."""
-        return self._each(lambda t, *_: t * self.stretch, xpos, xmat, boxes)
+        return self._each(lambda t, *_: t * self.stretch, xpos, xmat, boxes, heights)
 
     def _each(
-        self, answer: Callable[..., Array], xpos: Array, xmat: Array, boxes: casting.Boxes | None
+        self, answer: Callable[..., Array], xpos: Array, xmat: Array, boxes: Boxes, heights: Heights
     ) -> Array:
         """Returns what `answer` makes of each eye's entries, [E, H, W]."""
         boxes = boxes or (jnp.zeros((0, 3)), jnp.zeros((0, 3)))
+        heights = self.shapes.heights if heights is None else heights
+        if heights.shape != self.shapes.heights.shape:
+            raise ValueError(
+                f"heights are {heights.shape}, those of the model's height field "
+                f"{self.shapes.heights.shape}: give [nrow, ncol] of a field that is seen."
+            )
+        shapes = self.shapes._replace(heights=heights)
         if not len(self.shapes.kind) + len(boxes[0]):
             raise ValueError("There is nothing to see: every geom is hidden, and no box is given.")
         turn = xmat[self.body]
 
         def one(position: Array, axes: Array) -> Array:
-            seen = casting.before_eye(self.shapes, xpos, xmat, boxes, position, axes)
+            seen = casting.before_eye(shapes, xpos, xmat, boxes, position, axes)
             visible = casting.in_view(seen, self.rays, self.reach)
-            t, which = casting.nearest(seen, visible, self.rays)
+            t, which = casting.nearest(seen, visible, self.rays, self.reach)
             t = jnp.where(t * self.stretch <= self.reach, t, jnp.inf)
             return answer(t, which, seen).reshape(self.size)
 

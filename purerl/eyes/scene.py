@@ -7,8 +7,9 @@ import mujoco
 import numpy as np
 
 from purerl.core.errors import unknown_name
+from purerl.core.records import Array
 from purerl.eyes.eye import rotation
-from purerl.eyes.shapes import KINDS
+from purerl.eyes.shapes import FIELD, KINDS
 from purerl.physics import lookup
 
 GREY = np.array([0.299, 0.587, 0.114])  # of red, green and blue
@@ -25,6 +26,7 @@ class Shapes(NamedTuple):
     length: np.ndarray  # [S] of a capsule and a cylinder, half, over its radius
     radius: np.ndarray  # [S] of the bounding sphere [m]
     grey: np.ndarray  # [S] 0 to 1
+    heights: Array | np.ndarray  # [R, C] of the height field, 0 by 0 if there is none [m]
 
 
 def shapes_of(model: mujoco.MjModel, hide: Sequence[str] = ()) -> Shapes:
@@ -40,7 +42,14 @@ def shapes_of(model: mujoco.MjModel, hide: Sequence[str] = ()) -> Shapes:
             )
     seen = np.array(sorted(seen, key=lambda i: order[model.geom_type[i]]), int)
     kind = np.array([order[model.geom_type[i]] for i in seen], int)
-    scale = np.array([kinds[kind[n]].scale(model.geom_size[i]) for n, i in enumerate(seen)])
+    size, heights = model.geom_size.copy(), np.zeros((0, 0))
+    fields = seen[model.geom_type[seen] == FIELD]
+    if len(fields) > 1:
+        raise ValueError(f"Eyes see one height field, and {len(fields)} are here: `hide` others.")
+    for geom in fields:
+        field = model.hfield(model.geom_dataid[geom])
+        heights, size[geom] = field.data * field.size[2], field.size[[0, 1, 3]]
+    scale = np.array([kinds[kind[n]].scale(size[i]) for n, i in enumerate(seen)])
     scale, radius = scale.reshape(-1, 3), model.geom_rbound[seen]
     numbers = (
         model.geom_pos[seen],
@@ -49,6 +58,7 @@ def shapes_of(model: mujoco.MjModel, hide: Sequence[str] = ()) -> Shapes:
         model.geom_size[seen, 1] / scale[:, 0],
         np.where(radius > 0.0, radius, np.inf),  # a plane has none
         np.array([_grey(model, int(i)) for i in seen]),
+        heights,
     )
     return Shapes(model.geom_bodyid[seen], kind, *(x.astype(np.float32) for x in numbers))
 

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from purerl import eyes
+from purerl.eyes import shapes
 from purerl.eyes.eyes import ABYSS, CONTRAST, SHADE, SKY
+from tests import quick
 
 KINDS = {
     "plane": '<geom type="plane" size="0 0 1" pos="0 0 -.4" euler="5 3 0"/>',
@@ -18,15 +20,20 @@ KINDS = {
     "capsule": '<geom type="capsule" size=".15 .3" euler="20 60 40"/>',
     "cylinder": '<geom type="cylinder" size=".25 .2" euler="20 60 40"/>',
     "box": '<geom type="box" size=".3 .1 .2" euler="20 30 40"/>',
+    "field": '<geom name="hill" type="hfield" hfield="hills" euler="20 10 40"/>',
 }
+HILLS = np.random.default_rng(1).uniform(size=(5, 7))  # as it is in a model: 0 to 1
+HILLS = (HILLS - HILLS.min()) / np.ptp(HILLS)
+EPISODE = np.random.default_rng(2).uniform(size=(5, 7)).astype(np.float32)
 EYE = eyes.Eye("head", fovy=60.0)
 
 
 def model_of(*geoms: str, head: str = "") -> mujoco.MjModel:
     """Geoms around the origin, and a head without weight of its own that can be anywhere."""
     return mujoco.MjModel.from_xml_string(
-        '<mujoco><compiler angle="degree"/><worldbody>'
-        '<body mocap="true"><geom type="sphere" size="1e-3" rgba="0 0 0 0"/>'
+        '<mujoco><compiler angle="degree"/><asset><hfield name="hills" nrow="5" ncol="7" '
+        f'size=".4 .3 .25 .1" elevation="{" ".join(map(str, HILLS[::-1].ravel()))}"/></asset>'
+        '<worldbody><body mocap="true"><geom type="sphere" size="1e-3" rgba="0 0 0 0"/>'
         f"{''.join(geoms)}</body>"
         f'<body name="head" mocap="true">{head}'
         '<camera name="own" pos="0 0 .1" xyaxes="0 -1 0 0 0 1" fovy="70"/>'
@@ -48,12 +55,12 @@ def places(model: mujoco.MjModel, position, toward, turn: float = 0.0):
     return data, jnp.float32(data.xpos), jnp.float32(data.xmat.reshape(-1, 3, 3))
 
 
-def distance(sight: eyes.Eyes, *places) -> np.ndarray:
-    return np.asarray(jax.jit(sight.distance)(*places))
+def distance(sight: eyes.Eyes, *places, jit=jax.jit) -> np.ndarray:
+    return np.asarray(jit(sight.distance)(*places))
 
 
-def picture(sight: eyes.Eyes, *places) -> np.ndarray:
-    return np.asarray(jax.jit(sight.see)(*places))
+def picture(sight: eyes.Eyes, *places, jit=jax.jit) -> np.ndarray:
+    return np.asarray(jit(sight.see)(*places))
 
 
 def rays_of_mujoco(model, data, eye: eyes.Eye, size: int) -> np.ndarray:
@@ -76,7 +83,7 @@ def test_each_kind_is_where_mujocos_rays_meet_it(kind):
     model, random, hits = model_of(KINDS[kind]), np.random.default_rng(0), 0
     for far, fovy in ((1.0, 60.0), (100.0, 0.6)):
         eye = dataclasses.replace(EYE, fovy=fovy)
-        distances = jax.jit(eyes.Eyes(model, [eye], (15, 15), reach=1e3).distance)
+        distances = quick.jit(eyes.Eyes(model, [eye], (15, 15), reach=1e3).distance)
         for side in random.normal(size=(4, 3)):
             side[2] = abs(side[2])
             place, toward = far * side / np.linalg.norm(side), 0.1 * random.normal(size=3)
@@ -109,7 +116,8 @@ def test_all_together_the_nearest_is_seen_and_what_is_behind_costs_nothing():
         '<geom type="capsule" size=".1 .1" pos="-6 -1 -2"/>',
     )
     more = eyes.Eyes(model_of(*moved, *away), [EYE], (24, 24), reach=5.0)
-    assert np.array_equal(picture(sight, xpos, xmat), picture(more, xpos, xmat))
+    both = [picture(one, xpos, xmat, jit=quick.jit) for one in (sight, more)]
+    assert np.array_equal(*both)
 
 
 def test_boxes_of_an_episode_are_seen_like_those_of_the_model():
@@ -126,6 +134,35 @@ def test_boxes_of_an_episode_are_seen_like_those_of_the_model():
     found = distance(bare, xpos, xmat, boxes)
     assert np.array_equal(distance(sight, xpos, xmat), found) and np.isfinite(found).any()
     assert len(np.unique(picture(bare, xpos, xmat, boxes))) > 4
+
+
+def test_heights_of_an_episode_stand_for_those_of_the_model():
+    """4 s. Against MuJoCo's rays and normals, inside a wide field whose heights are other ones."""
+    model, random = model_of(KINDS["field"].replace("euler", 'pos=".1 0 -.3" euler')), EPISODE
+    sight = eyes.Eyes(model, [EYE], (15, 15), reach=5.0)
+    model.hfield_data[:] = random.ravel()
+    data, xpos, xmat = places(model, [0.05, 0.1, 0.2], [0.3, 0.2, -0.2])
+    found = distance(sight, xpos, xmat, None, 0.25 * random, jit=quick.jit)[0]
+    right = rays_of_mujoco(model, data, EYE, 15)
+    both = np.isfinite(found) & np.isfinite(right)
+    assert both.mean() > 0.5
+    np.testing.assert_allclose(found[both], right[both], rtol=1e-4)
+    again = picture(eyes.Eyes(model, [EYE], (15, 15), reach=5.0), xpos, xmat, jit=quick.jit)
+    assert np.array_equal(again, picture(sight, xpos, xmat, None, 0.25 * random, jit=quick.jit))
+    assert len(np.unique(again)) > 5  # each triangle is lit as it lies
+
+
+def test_a_normal_of_a_field_is_that_of_its_triangle():
+    random = np.random.default_rng(0)
+    heights, point = random.uniform(size=(4, 6)), random.uniform(-1, 1, (50, 3))
+    normals = shapes._normal_of_field(jnp.float32(point), jnp.float32(heights))
+    for (x, y, _), normal in zip(point, np.asarray(normals), strict=True):
+        column, row = int(2.5 * (x + 1)), int(1.5 * (y + 1))
+        right = 2.5 * (x + 1) - column > 1.5 * (y + 1) - row
+        corners = [(row, column), (row + 1, column + 1), (row + (not right), column + right)]
+        a, b, c = (np.array([j / 2.5 - 1, i / 1.5 - 1, heights[i, j]]) for i, j in corners)
+        other = np.cross(b - a, c - a)
+        assert np.allclose(normal, other / other[2], atol=1e-5)
 
 
 def test_upright_and_right_way_round():
@@ -227,6 +264,16 @@ def test_a_camera_of_the_model_is_an_eye():
         (lambda: eyes.Eye("head", up=(0, 0, np.nan)), "up is .*; give three finite numbers"),
         (lambda: eyes.Eyes(model_of(), []), "give at least one eye"),
         (lambda: eyes.Eyes(mesh(), [EYE]), "do not see a mesh, and geom 'stone' is one"),
+        (
+            lambda: eyes.Eyes(model_of(*2 * [KINDS["field"].replace('name="hill" ', "")]), [EYE]),
+            "Eyes see one height field, and 2 are here: `hide` others",
+        ),
+        (
+            lambda: eyes.Eyes(model_of(KINDS["field"]), [EYE]).see(
+                jnp.zeros((3, 3)), jnp.zeros((3, 3, 3)), None, jnp.zeros((7, 5))
+            ),
+            r"heights are \(7, 5\), those of the model's height field \(5, 7\): give \[nrow, ncol",
+        ),
     ],
 )
 def test_mistakes_are_a_line(make, message):
