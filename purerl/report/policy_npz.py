@@ -47,7 +47,7 @@ def policy_arrays(run: Run) -> dict[str, Any]:
     dense = {f"layer{i}": layers[f"Dense_{i}"] for i in range(len(layers))}
     dense |= params.get("cell", {}) | {"loc": params["head"]["loc"]}
     encoders = [x for name, x in sorted(seeing.items()) if name.startswith("Convolutions_")]
-    windows = np.transpose([options.eyes.kernels, options.eyes.strides]) if encoders else []
+    windows: Any = np.transpose([options.eyes.kernels, options.eyes.strides]) if encoders else []
     for i, encoder in enumerate(encoders):
         dense |= {f"eye{i}/{name}": layer for name, layer in encoder.items()}
     return _normalizer(run) | {

@@ -1,6 +1,7 @@
 """`python -m purerl.check`: a broken environment or network for each check, which finds just it."""
 
 import dataclasses
+import itertools
 import re
 from types import SimpleNamespace
 
@@ -217,6 +218,46 @@ def test_speed_is_measured_only_when_asked(monkeypatch):
     assert told.endswith("takes 0.01 s, so timing 4 takes about 0 s, and compiling")
     assert alone == "64 steps/s of the environments alone"
     assert update.startswith("16 steps/s in an update of 2.00 s: 12 updates take 0.4 min")
+
+
+@dataclasses.dataclass(frozen=True)
+class Pictured(Toy):
+    """Notes each picture that is made."""
+
+    made: list
+
+    def reset(self, key):
+        return self._seen(super().reset(key))
+
+    def step(self, state, action):
+        return self._seen(super().step(state, action))
+
+    def _seen(self, state):
+        def draw(_):
+            self.made.append(1)
+            return np.zeros((1, 4, 4), np.uint8)
+
+        shape = jax.ShapeDtypeStruct((1, 4, 4), np.uint8)
+        picture = jax.pure_callback(draw, shape, state.physics, vmap_method="sequential")
+        return state.replace(observation={"policy": state.physics, "eyes": picture})
+
+
+def test_what_pictures_cost_is_told_by_steps_that_make_none(monkeypatch):
+    made, took = [], iter([0.01, 0.5, 0.125])  # a step of each, many, as many without pictures
+    numbers = []
+
+    def seconds(function):
+        made.clear()
+        jax.block_until_ready(function())
+        numbers.append(len(made))
+        return next(took)
+
+    monkeypatch.setattr(examine, "_seconds", seconds)
+    config = Config(num_steps=64, num_envs=4, rollout_length=8, num_minibatches=1)
+    setup = SimpleNamespace(config=config, env=Pictured(made))
+    told = itertools.islice(examine._speeds(setup, examine._starts(setup, 4)), 3)
+    assert [one.text for one in told][2] == "75% of that are pictures: 11719 us for those of a step"
+    assert numbers == [4, 4 * 8, 0]
 
 
 def test_the_shorter_time_of_two_counts_and_not_the_first(monkeypatch):

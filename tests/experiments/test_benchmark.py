@@ -1,5 +1,6 @@
 """The benchmark's figures: what is counted, what is read, what a command is made of."""
 
+import collections
 import csv
 import dataclasses
 import json
@@ -8,9 +9,11 @@ import sys
 from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import purerl
 from purerl.core.errors import UserError
 from purerl.experiment.loading import find
 from purerl.experiments.benchmarks import benchmark, scaling, start_up
@@ -44,6 +47,21 @@ def test_every_part_is_run():
     weights = [jax.tree.leaves(state.params)[0] for state in (bench.state, learned)]
     assert (np.asarray(weights[0]) != np.asarray(weights[1])).any()
     assert all(t.steps_per_second > 0 for t in benchmark.measure(bench.parts, 1, 0.0))
+
+
+def test_eyes_look_once_in_each_step_where_bodies_are():
+    """Each picture is another one: the last is of the last step."""
+    seen = SimpleNamespace(see=lambda xpos, xmat, boxes: xpos + boxes[0])
+    readings = SimpleNamespace(xpos=jnp.zeros((1, 3)), xmat=jnp.eye(3)[None])
+    env = SimpleNamespace(
+        eyes=seen,
+        physics=SimpleNamespace(init=lambda qpos, qvel, changes: (None, readings)),
+        scenery=lambda state: (state.physics.qpos[None], None),
+    )
+    places = collections.namedtuple("Places", "qpos qvel")(jnp.ones((2, 3)), jnp.zeros((2, 3)))
+    state = SimpleNamespace(env_state=purerl.State(places, *6 * [()]))
+    last = benchmark.eyes_alone(env, SimpleNamespace(rollout_length=4), state)
+    np.testing.assert_allclose(last, 1 + 3e-4, rtol=1e-6)
 
 
 @pytest.mark.slow
