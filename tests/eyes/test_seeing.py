@@ -69,10 +69,10 @@ def test_numpy_sees_the_same_in_windows_that_overlap(shared, kernels, tmp_path):
     lab = eyes.Encoder((4, 8)[: len(kernels)], kernels, (1, 2)[: len(kernels)], 6, shared)
     network = eyes.mlp(options := eyes.MlpOptions(eyes=lab), SEEN, 2)
     params, _ = jax.jit(network.init)(jax.random.key(0))
-    drawn = (0.2 * np.random.default_rng(0).normal(size=x.shape) for x in jax.tree.leaves(params))
-    params = jax.tree.unflatten(jax.tree.structure(params), map(jnp.float32, drawn))
+    random = np.random.default_rng(0)
+    params = jax.tree.map(lambda x: jnp.float32(0.2 * random.normal(size=x.shape)), params)
     policy = exported(options, params, tmp_path / "p.npz")
-    pictures = np.random.default_rng(1).integers(0, 256, (3, 2, 12, 12), np.uint8)
+    pictures = random.integers(0, 256, (3, 2, 12, 12), np.uint8)
     seen = {name: np.broadcast_to(x, (3, *x.shape)) for name, x in SEEN.items()}
     seen["eyes"] = pictures
     right = jax.jit(network.apply)(params, seen | {"eyes": pictures / 127.5 - 1}, ())[0]
