@@ -157,11 +157,8 @@ def _speeds(setup: Setup, start: State) -> Iterator[Finding]:
 
 def _with_pictures_of(before: State, state: State) -> State:
     """Returns a state with an earlier one's pictures: those that nothing takes are not made."""
-
-    def older(x: Any, y: Any) -> Any:
-        return y if x.dtype == jnp.uint8 else x
-
-    kept = jax.tree.map(older, state.observation, before.observation)
+    new, old = state.observation, before.observation
+    kept = jax.tree.map(lambda x, y: y if x.dtype == jnp.uint8 else x, new, old)
     return state.replace(observation=kept)
 
 

@@ -47,11 +47,10 @@ class Policy:
         for eye in range(pictures.shape[-3]):
             name = f"eye{eye % a['encoders']}"
             x = pictures[..., eye, :, :, None] / np.float32(127.5) - 1
-            for layer, (kernel, stride) in enumerate(a["windows"]):
+            for i, (kernel, stride) in enumerate(a["windows"]):
                 x = np.lib.stride_tricks.sliding_window_view(x, (kernel, kernel), (-3, -2))
                 x = np.moveaxis(x[..., ::stride, ::stride, :, :, :], -3, -1)
-                x = x.reshape(*x.shape[:-3], -1)
-                x = np.maximum(self._dense(f"{name}/Dense_{layer}", x), 0)
+                x = np.maximum(self._dense(f"{name}/Dense_{i}", x.reshape(*x.shape[:-3], -1)), 0)
             x = self._dense(f"{name}/Dense_{len(a['windows'])}", x.reshape(*x.shape[:-3], -1))
             x = (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-6)
             yield np.maximum(x * a[f"{name}/LayerNorm_0/scale"] + a[f"{name}/LayerNorm_0/bias"], 0)
