@@ -170,9 +170,13 @@ def with_planes(root: mjcf.RootElement, model: mujoco.MjModel, body: Body) -> mu
 def mix_pairs(model: mujoco.MjModel) -> None:
     """Gives each pair what a contact of its geoms has without it: the compiler leaves defaults."""
     sides = np.stack([model.pair_geom1, model.pair_geom2])
-    share = (model.geom_solmix[sides] / model.geom_solmix[sides].sum(0))[..., None]
-    model.pair_dim[:] = model.geom_condim[sides].max(0)
-    model.pair_friction[:] = model.geom_friction[sides].max(0)[:, [0, 0, 1, 2, 2]]
+    priority = model.geom_priority[sides]
+    counts = priority == priority.max(0)  # the geom of the higher priority alone, else both
+    share = counts * model.geom_solmix[sides]
+    share = (share / share.sum(0))[..., None]
+    friction = (counts[..., None] * model.geom_friction[sides]).max(0)
+    model.pair_dim[:] = (counts * model.geom_condim[sides]).max(0)
+    model.pair_friction[:] = friction[:, [0, 0, 1, 2, 2]]
     model.pair_solref[:] = (share * model.geom_solref[sides]).sum(0)
     model.pair_solimp[:] = (share * model.geom_solimp[sides]).sum(0)
 
