@@ -47,7 +47,7 @@ class Bowl:
 
 
 class Tables(NamedTuple):
-    """What heights are made with: `shape * (spline @ coefficients @ spline.T)`."""
+    """What heights are made with: the shape, times the spline's bumps along both axes."""
 
     filter: np.ndarray  # [B, B] bumps -> coefficients, along one axis
     spline: np.ndarray  # [G, B] coefficients -> heights, along one axis; four in a row are not 0
@@ -87,7 +87,7 @@ def heights(bowl: Bowl, terrain: Array) -> Array:
 
 
 def _both_ways(matrix: np.ndarray, x: Array) -> Array:
-    """Returns matrix @ x @ matrix.T; a GPU would round what goes into it."""
+    """Applies a matrix along both axes of x; a GPU would round what goes into it."""
     exact, own = jax.lax.Precision.HIGHEST, jnp.float32(matrix)
     return jnp.matmul(jnp.matmul(own, x, precision=exact), own.T, precision=exact)
 
