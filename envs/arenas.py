@@ -21,12 +21,11 @@ from dm_control.locomotion.arenas import corridors, floors
 
 from purerl import Array
 from purerl.envs.bodies import Body
-from purerl.envs.bowls import Bowl
+from purerl.envs.bowls import Bowl, add_terrain
 from purerl.envs.mazes import Maze
 
 GROUND = "ground"  # the floor's geom; a corridor's boxes are ground_0, ground_1, ...
 TARGET = "target"  # body and geom of the floor's orb
-TERRAIN = "terrain"  # a bowl's height field and its geom
 TREAT = 0.05  # radius of a maze's targets [m]
 _THICKNESS = 0.16  # half height of a platform, as in dm_control [m]
 
@@ -120,7 +119,9 @@ def build_arena(arena: Arena) -> mjcf.RootElement:
     if isinstance(arena, Floor):
         return _build_floor(arena)
     if isinstance(arena, Bowl):
-        return _build_bowl(arena)
+        root = _build_floor(Floor())
+        add_terrain(root, arena)
+        return root
     if isinstance(arena, Maze):
         return _build_maze(arena)
     root = corridors.EmptyCorridor(name="arena", visible_side_planes=False).mjcf_model
@@ -154,15 +155,6 @@ def _build_maze(arena: Maze) -> mjcf.RootElement:
         body.add("geom", name=f"{GROUND}_{i}", type="box", size=half, mass=0)
     for i in range(arena.targets):
         _add_target(root, f"{TARGET}_{i}", TREAT)
-    return root
-
-
-def _build_bowl(arena: Bowl) -> mjcf.RootElement:
-    """A floor, and the terrain as eyes see it: physics has planes, by `compose.with_planes`."""
-    root, size = _build_floor(Floor()), (arena.half, arena.half, arena.height, 0.1)
-    root.asset.add("hfield", name=TERRAIN, nrow=arena.edges, ncol=arena.edges, size=size)
-    ground = {"pos": [0, 0, -arena.depth], "rgba": [0.4, 0.45, 0.5, 1]}
-    root.worldbody.add("geom", name=TERRAIN, type="hfield", hfield=TERRAIN, **ground)
     return root
 
 

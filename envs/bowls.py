@@ -9,14 +9,19 @@ The letters: G edges of cells along x and along y, K points.
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
+from dm_control import mjcf
 from scipy import ndimage
 
 from purerl import Array
+
+TERRAIN = "terrain"  # the height field and its geom
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +47,7 @@ class Bowl:
 
 
 class Tables(NamedTuple):
-    """What heights are made with: `shape * (spline @ coefficients @ spline.T)`."""
+    """What heights are made with: the shape, times the spline's bumps along both axes."""
 
     filter: np.ndarray  # [B, B] bumps -> coefficients, along one axis
     spline: np.ndarray  # [G, B] coefficients -> heights, along one axis; four in a row are not 0
@@ -82,7 +87,7 @@ def heights(bowl: Bowl, terrain: Array) -> Array:
 
 
 def _both_ways(matrix: np.ndarray, x: Array) -> Array:
-    """Returns matrix @ x @ matrix.T; a GPU would round what goes into it."""
+    """Applies a matrix along both axes of x; a GPU would round what goes into it."""
     exact, own = jax.lax.Precision.HIGHEST, jnp.float32(matrix)
     return jnp.matmul(jnp.matmul(own, x, precision=exact), own.T, precision=exact)
 
@@ -152,3 +157,45 @@ def _grid(number: int, step: float) -> np.ndarray:
     """Returns the middles of 2 * number by 2 * number squares around the origin, [P, 2]."""
     along = (np.arange(-number, number) + 0.5) * step
     return np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
+
+
+# --- what MuJoCo gets of it ---
+
+
+def add_terrain(root: mjcf.RootElement, bowl: Bowl) -> None:
+    """Adds a height field for eyes to a floor, flat until an episode says what heights it has."""
+    size = (bowl.half, bowl.half, bowl.height, 0.1)
+    root.asset.add("hfield", name=TERRAIN, nrow=bowl.edges, ncol=bowl.edges, size=size)
+    looks = {"pos": [0, 0, -bowl.depth], "rgba": [0.4, 0.45, 0.5, 1]}
+    root.worldbody.add("geom", name=TERRAIN, type="hfield", hfield=TERRAIN, **looks)
+
+
+def with_planes(root: mjcf.RootElement, name: str, touching: Sequence[str]) -> mujoco.MjModel:
+    """Compiles a bowl with planes in the terrain's place, called `name`_0, ..., one for each geom.
+
+    A geom alone meets its own, which is clear, and lies anywhere until an environment says where
+    the ground beneath that geom is. `touching`: names of the geoms.
+    """
+    root.find("geom", TERRAIN).remove()
+    root.find("hfield", TERRAIN).remove()
+    for number, geom in enumerate(touching):
+        flat = {"type": "plane", "size": [1, 1, 1], "rgba": [0, 0, 0, 0]}
+        plane = root.worldbody.add("geom", name=f"{name}_{number}", **flat)
+        root.contact.add("pair", geom1=plane, geom2=root.find("geom", geom))
+    model = mjcf.Physics.from_mjcf_model(root).model.ptr
+    mix_pairs(model)
+    return model
+
+
+def mix_pairs(model: mujoco.MjModel) -> None:
+    """Gives each pair what a contact of its geoms has without it: the compiler leaves defaults."""
+    sides = np.stack([model.pair_geom1, model.pair_geom2])
+    priority = model.geom_priority[sides]
+    counts = priority == priority.max(0)  # the geom of the higher priority alone, else both
+    share = counts * model.geom_solmix[sides]
+    share = (share / share.sum(0))[..., None]
+    friction = (counts[..., None] * model.geom_friction[sides]).max(0)
+    model.pair_dim[:] = (counts * model.geom_condim[sides]).max(0)
+    model.pair_friction[:] = friction[:, [0, 0, 1, 2, 2]]
+    model.pair_solref[:] = (share * model.geom_solref[sides]).sum(0)
+    model.pair_solimp[:] = (share * model.geom_solimp[sides]).sum(0)

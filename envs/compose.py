@@ -17,7 +17,6 @@ from purerl import choose_engine, lookup
 from purerl.envs.arenas import (
     GROUND,
     TARGET,
-    TERRAIN,
     Arena,
     BoxFields,
     box_fields,
@@ -25,7 +24,7 @@ from purerl.envs.arenas import (
     check_passable,
 )
 from purerl.envs.bodies import Body
-from purerl.envs.bowls import Bowl
+from purerl.envs.bowls import Bowl, with_planes
 
 PREFIX = "walker/"  # composing puts it before the names of the body's parts
 TORSO_VELOCITY = "torso_velocity"  # a sensor of the walker's centre of mass [m/s]
@@ -86,7 +85,9 @@ def compose(
     model = mjcf.Physics.from_mjcf_model(root).model.ptr
     looks = copy.copy(model)
     if isinstance(arena, Bowl):
-        model = with_planes(root, model, body)
+        names = lookup.names(model, "geom")
+        touching = [n for n in names if n.startswith(PREFIX) and _touches_ground(model, n, body)]
+        model = with_planes(root, GROUND, touching)
     mask_contacts(model, body, self_collision)
     round_ellipsoids(model)
     free_boxes(model)
@@ -145,36 +146,6 @@ def attach(root: mjcf.RootElement, walker: mjcf.RootElement, body: Body, x: floa
     frame = root.attach(walker)
     frame.pos = [x, 0, body.spawn_height]
     frame.add("freejoint")
-
-
-def with_planes(root: mjcf.RootElement, model: mujoco.MjModel, body: Body) -> mujoco.MjModel:
-    """Returns a bowl's model with planes for its terrain, one for each geom that can touch it.
-
-    A geom alone meets its own, which is clear, and lies anywhere until an environment says where
-    the ground beneath that geom is.
-    """
-    root.find("geom", TERRAIN).remove()
-    root.find("hfield", TERRAIN).remove()
-    names = [n for n in lookup.names(model, "geom") if n.startswith(PREFIX)]
-    touching = [n for n in names if _touches_ground(model, n, body)]
-    for number, name in enumerate(touching):
-        plane = root.worldbody.add(
-            "geom", name=f"{GROUND}_{number}", type="plane", size=[1, 1, 1], rgba=[0, 0, 0, 0]
-        )
-        root.contact.add("pair", geom1=plane, geom2=root.find("geom", name))
-    model = mjcf.Physics.from_mjcf_model(root).model.ptr
-    mix_pairs(model)
-    return model
-
-
-def mix_pairs(model: mujoco.MjModel) -> None:
-    """Gives each pair what a contact of its geoms has without it: the compiler leaves defaults."""
-    sides = np.stack([model.pair_geom1, model.pair_geom2])
-    share = (model.geom_solmix[sides] / model.geom_solmix[sides].sum(0))[..., None]
-    model.pair_dim[:] = model.geom_condim[sides].max(0)
-    model.pair_friction[:] = model.geom_friction[sides].max(0)[:, [0, 0, 1, 2, 2]]
-    model.pair_solref[:] = (share * model.geom_solref[sides]).sum(0)
-    model.pair_solimp[:] = (share * model.geom_solimp[sides]).sum(0)
 
 
 # Changes to the compiled model.

@@ -90,13 +90,12 @@ class Eyes:
     ) -> Array:
         """Returns what `answer` makes of each eye's entries, [E, H, W]."""
         boxes = boxes or (jnp.zeros((0, 3)), jnp.zeros((0, 3)))
-        heights = self.shapes.heights if heights is None else heights
-        if heights.shape != self.shapes.heights.shape:
+        shapes = self.shapes if heights is None else self.shapes._replace(heights=heights)
+        if shapes.heights.shape != self.shapes.heights.shape:
             raise ValueError(
-                f"heights are {heights.shape}, those of the model's height field "
+                f"heights are {shapes.heights.shape}, those of the model's height field "
                 f"{self.shapes.heights.shape}: give [nrow, ncol] of a field that is seen."
             )
-        shapes = self.shapes._replace(heights=heights)
         if not len(self.shapes.kind) + len(boxes[0]):
             raise ValueError("There is nothing to see: every geom is hidden, and no box is given.")
         turn = xmat[self.body]

@@ -139,10 +139,6 @@ def _enter_field(o: Vector, d: Vector, form: tuple[Array, Array]) -> Array:
     return jax.lax.while_loop(lambda c: ((c[0] < end) & jnp.isinf(c[3])).any(), go_on, carry)[3]
 
 
-def _normal_of_ball(p: Array, length: Array) -> Array:
-    return p
-
-
 def _normal_of_capsule(p: Array, length: Array) -> Array:
     return p - UP * jnp.clip(p, -length[..., None], length[..., None])
 
@@ -171,8 +167,8 @@ def _normal_of_field(p: Array, heights: Array) -> Array:
 KINDS = {
     _GEOM.mjGEOM_PLANE: Kind(np.ones_like, _enter_plane, _normal_of_plane),
     FIELD: Kind(lambda s: s, _enter_field, _normal_of_field),  # heights in place of a length
-    _GEOM.mjGEOM_SPHERE: Kind(lambda s: s[[0, 0, 0]], _enter_ball, _normal_of_ball),
-    _GEOM.mjGEOM_ELLIPSOID: Kind(lambda s: s, _enter_ball, _normal_of_ball),
+    _GEOM.mjGEOM_SPHERE: Kind(lambda s: s[[0, 0, 0]], _enter_ball, lambda p, _: p),
+    _GEOM.mjGEOM_ELLIPSOID: Kind(lambda s: s, _enter_ball, lambda p, _: p),
     _GEOM.mjGEOM_CAPSULE: Kind(lambda s: s[[0, 0, 0]], _enter_capsule, _normal_of_capsule),
     _GEOM.mjGEOM_CYLINDER: Kind(lambda s: s[[0, 0, 0]], _enter_cylinder, _normal_of_cylinder),
     _GEOM.mjGEOM_BOX: Kind(lambda s: s, _enter_box, _normal_of_box),

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from purerl import eyes
-from purerl.envs import run, sight
+from purerl.envs import bowls, escape_bowl, run, sight
 from purerl.envs.compose import PREFIX, compose
 from purerl.physics import lookup
 
@@ -43,6 +43,10 @@ def main() -> None:
             share = right / hits
             print(f"{body}: {share:.4%} of {hits:,} pixels agree; {seen} kinds of geom are seen")
             assert share > 0.999
+    for body in () if words.speed else BODIES:
+        hits, right = compare_bowl(body, words.states, words.size)
+        print(f"{body} in a bowl: {right / hits:.4%} of {hits:,} pixels agree")
+        assert right / hits > 0.999
 
 
 def states(env: run.Run, number: int) -> tuple:
@@ -73,8 +77,7 @@ def compare(body: str, arena: dict, number: int, size: int) -> tuple[int, int, i
     parts = compose(env.parts.body, wide, "c")
     model, platforms = parts.looks, list(parts.boxes.boxes)
     model.geom_sameframe[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-    model.vis.map.znear, model.vis.map.zfar = 5e-4 / model.stat.extent, 30 / model.stat.extent
-    model.vis.quality.numslices = model.vis.quality.numstacks = 200
+    look_close(model)
     camera = f"{PREFIX}{env.parts.body.camera}"
     window = [lookup.names(env.parts.looks, "geom")[i] for i in env.parts.boxes.boxes]
     eye = eyes.of_camera(env.parts.looks, camera)
@@ -89,13 +92,59 @@ def compare(body: str, arena: dict, number: int, size: int) -> tuple[int, int, i
             mujoco.mj_kinematics(model, data)
             mujoco.mj_camlight(model, data)
             renderer.update_scene(data, camera)
-            depth, found = renderer.render(), distance[i, 0] / ours.stretch.reshape(size, size)
-            both = np.isfinite(found) & (depth < FAR)
-            error = np.abs(found - depth)[both]
-            hits += both.sum()
-            right += (error < np.maximum(0.01 * depth[both], 1e-3)).sum()
+            more = agreeing(renderer.render(), distance[i, 0] / ours.stretch.reshape(size, size))
+            hits, right = hits + more[0], right + more[1]
             seen |= set(model.geom_type.tolist())
     return int(hits), int(right), len(seen)
+
+
+def compare_bowl(body: str, number: int, size: int) -> tuple[int, int]:
+    """As `compare`, anywhere in bowls: pixels that both hit, and those that agree."""
+    env = escape_bowl.build(escape_bowl.Options(body=body), "c")
+    model, random = env.parts.looks, np.random.default_rng(0)
+    look_close(model)
+    camera = f"{PREFIX}{env.parts.body.camera}"
+    ours = eyes.Eyes(model, [eyes.of_camera(model, camera)], (size, size), reach=FAR)
+    see = jax.jit(ours.distance)
+    draw = jax.jit(lambda key: env.reset(key).task["terrain"])
+    heights = jax.jit(lambda terrain: bowls.heights(env.bowl, terrain))
+    data, hits, right = mujoco.MjData(model), 0, 0
+    for i in range(number):
+        place = random.uniform(-5, 5, 2)
+        terrain = draw(jax.random.key(i))
+        ground, _ = bowls.ground(env.bowl, terrain, jnp.float32(place)[None])
+        data.qpos[:] = model.qpos0
+        data.qpos[:2] = place
+        data.qpos[2] += float(ground[0]) + 0.1 * random.random()
+        turn = np.array([1, 0, 0, 0]) + 0.15 * random.normal(size=4)
+        turn[3] = random.normal()
+        data.qpos[3:7] = turn / np.linalg.norm(turn)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        high = heights(terrain)
+        model.hfield_data[:] = np.asarray(high).ravel() / env.bowl.height
+        xpos, xmat = jnp.float32(data.xpos), jnp.float32(data.xmat.reshape(-1, 3, 3))
+        found = np.asarray(see(xpos, xmat, None, high))[0]
+        # A renderer keeps the heights that it was made with.
+        with mujoco.Renderer(model, size, size, max_geom=2000) as renderer:
+            renderer.enable_depth_rendering()
+            renderer.update_scene(data, camera)
+            more = agreeing(renderer.render(), found / ours.stretch.reshape(size, size))
+        hits, right = hits + more[0], right + more[1]
+    return hits, right
+
+
+def look_close(model: mujoco.MjModel) -> None:
+    """Lets a renderer draw what is near, and round shapes round."""
+    model.vis.map.znear, model.vis.map.zfar = 5e-4 / model.stat.extent, 30 / model.stat.extent
+    model.vis.quality.numslices = model.vis.quality.numstacks = 200
+
+
+def agreeing(depth: np.ndarray, found: np.ndarray) -> tuple[int, int]:
+    """Returns how many pixels both hit, and how many of them to 1% or 1 mm."""
+    both = np.isfinite(found) & (depth < FAR)
+    error = np.abs(found - depth)[both]
+    return int(both.sum()), int((error < np.maximum(0.01 * depth[both], 1e-3)).sum())
 
 
 def speed(body: str, arena: dict) -> None:
