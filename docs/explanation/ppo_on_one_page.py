@@ -130,7 +130,7 @@ def rollout(config: Config, env: Env, network: Network, state: State) -> tuple[S
 
     def step(now: tuple, t: Array) -> tuple[tuple, Row]:
         env_state, length, limit, discounted = now
-        (loc, scale), value = ask(env_state)
+        (loc, scale), value, _ = ask(env_state)
         keys = per_environment(derive(state.key, Purpose.ACTION, state.update, t), ids)
         raw = loc + scale * jax.vmap(lambda key: jax.random.normal(key, (env.action_size,)))(keys)
         after, length = jax.vmap(env.step)(env_state, jnp.tanh(raw)), length + 1
@@ -159,7 +159,7 @@ def rollout(config: Config, env: Env, network: Network, state: State) -> tuple[S
 def loss(params: Any, config: Config, network: Network, minibatch: tuple) -> Array:
     """Returns -L of a minibatch, []; `old` are the log-probabilities of `raw` when it was drawn."""
     observation, raw, old, advantage, target = minibatch
-    ((loc, scale), value), _ = network.apply(params, observation, ())
+    ((loc, scale), value, _), _ = network.apply(params, observation, ())
     std = jnp.maximum(jnp.sqrt(advantage.var()) + 1e-8, config.min_advantage_std)
     advantage = (advantage - advantage.mean()) / std
     advantage = jnp.clip(advantage, -config.advantage_clip, config.advantage_clip)

@@ -22,6 +22,7 @@ class Purpose(enum.IntEnum):
     PERMUTATION = 5
     EVALUATION = 6
     VIDEO = 7
+    NETWORK = 8
 
 
 def derive(key: Array, purpose: Purpose, *indices: Array | int) -> Array:

@@ -47,6 +47,7 @@ class PolicyOutput(NamedTuple):
 
     distribution: Normal  # over raw (unsquashed) actions [..., A]
     value: Array  # [...] expected discounted return, in scaled-reward units
+    losses: dict[str, Array] = {}  # name -> [...]; `Config.auxiliary` weighs their means
 
 
 class Network(NamedTuple):
@@ -57,10 +58,19 @@ class Network(NamedTuple):
     feed-forward network returns `()`.
     `apply(params, observation, memory) -> (PolicyOutput, memory)`: `observation` has any leading
     batch axes, leaves [..., O], and `memory` has the same ones, leaves [..., H]. `params` has none.
+    `draw(key) -> noise`: noise of its own, of one environment in one step. A rollout keeps it, and
+    whoever learns from the step reads it: `apply(params, observation, memory, noise)`. Where
+    nothing is drawn (a policy that acts by its mean, a value to bootstrap from), `apply` is called
+    without it, and answers by the mean too.
+    `scale(directions)`: what the rate multiplies, of Adam's directions of `params`.
+    `hold(old, new)`: the statistics of observations, of those before an update and after it.
     """
 
     init: Callable[[Array], tuple[PyTree, PyTree]]
-    apply: Callable[[PyTree, PyTree, PyTree], tuple[PolicyOutput, PyTree]]
+    apply: Callable[..., tuple[PolicyOutput, PyTree]]
+    draw: Callable[[Array], PyTree] | None = None
+    scale: Callable[[PyTree], PyTree] = lambda directions: directions
+    hold: Callable[[PyTree, PyTree], PyTree] = lambda old, new: new
 
 
 class Counter(struct.PyTreeNode):

@@ -21,7 +21,6 @@ def temporal_difference(
       terminated: [T] bool: nothing comes after the step.
       gamma: discount.
     """
-    chex.assert_equal_shape([reward, value, next_value, terminated])
     # `where`, not a product: the value of what comes after an end may be NaN, as 0 times NaN is.
     return reward + gamma * jnp.where(terminated, 0.0, next_value) - value
 

@@ -178,7 +178,7 @@ def improve(
     # Those of observations move last. While they stood still, the learner normalized as the policy
     # that acted did, so that its first ratio was exactly 1.
     state = state.replace(
-        normalizer=merge(state.normalizer, pool(observations)),
+        normalizer=network.hold(state.normalizer, merge(state.normalizer, pool(observations))),
         update=state.update + 1,
         steps=add_count(state.steps, jnp.asarray(config.steps_per_update, jnp.uint32)),
     )

@@ -12,13 +12,17 @@ from purerl.ppo.config import Config
 
 
 class Batch(NamedTuple):
-    """What the losses read; a rollout's is [T, B, ...], a minibatch's [T', M', ...]."""
+    """What the losses read; a rollout's is [T, B, ...], a minibatch's [T', M', ...].
+
+    A field that `Transition` has too is that of the rollout.
+    """
 
     observation: PyTree  # [..., O] normalized
     raw_action: Array  # [..., A]
     noise: Normal | None  # [..., A] of the action's noise, as `Transition` has it
+    drawn: tuple  # of the network's own noise, as `Transition` has it
     log_prob: Array  # [...] under the policy that acted, with that noise
-    old_value: Array  # [...] V(s_t), of the policy that acted
+    value: Array  # [...] V(s_t), of the policy that acted
     advantage: Array  # [...]
     target: Array  # [...] of the value
     valid: Array  # [...] bool: False where the physics blew up
@@ -54,25 +58,13 @@ def make_batch(config: Config, state: TrainState, transitions: rollout.Transitio
     of_one = functools.partial(advantages.gae, gamma=config.gamma, lambda_=config.gae_lambda)
     # Computed once. Through all epochs the advantages and the targets are those of the policy that
     # acted, so no gradient passes through them.
-    advantage = jax.vmap(of_one, in_axes=1, out_axes=1)(
-        transitions.reward * reward_factor(config, state),
-        transitions.value,
-        transitions.next_value,
-        transitions.terminated,
-        transitions.done,
-        transitions.valid,
-    )
-    return Batch(
-        observation=running_moments.normalize(state.normalizer, transitions.observation),
-        raw_action=transitions.raw_action,
-        noise=transitions.noise,
-        log_prob=transitions.log_prob,
-        old_value=transitions.value,
-        advantage=advantage,
-        target=advantage + transitions.value,
-        valid=transitions.valid,
-        is_first=transitions.is_first,
-    )
+    seen = transitions._asdict()
+    reward = transitions.reward * reward_factor(config, state)
+    judged = [seen[name] for name in ("value", "next_value", "terminated", "done", "valid")]
+    advantage = jax.vmap(of_one, in_axes=1, out_axes=1)(reward, *judged)
+    seen["observation"] = running_moments.normalize(state.normalizer, transitions.observation)
+    seen |= {"advantage": advantage, "target": advantage + transitions.value}
+    return Batch(**{name: seen[name] for name in Batch._fields})
 
 
 def in_one_row(samples: PyTree) -> PyTree:

@@ -9,16 +9,15 @@ if TYPE_CHECKING:
 # int32, in which updates, samples and steps of an episode are counted, ends below this.
 COUNTS = 2**31
 SIZE = "at least 1 and below 2**31 - 1", lambda x: 1 <= x < COUNTS - 1
+ABOVE = "a number above 0, and finite", lambda x: 0.0 < x < math.inf
+LEAST = "0 or above", lambda x: 0.0 <= x < math.inf
 # What a setting must be, how that is told, and the names of those that must be so.
 TRAINING = (
     (*SIZE, "num_envs rollout_length num_epochs num_minibatches episode_length"),
     ("at most 2**53", lambda x: x <= 2**53, "num_steps"),  # what reads metrics.jsonl has float64
     ("in [0, 1]", lambda x: 0.0 <= x <= 1.0, "gamma gae_lambda"),
-    ("a number above 0, and finite", lambda x: 0.0 < x < math.inf, "learning_rate desired_kl"),
-    ("a number above 0, and finite", lambda x: 0.0 < x < math.inf, "clip max_gradient_norm"),
-    ("a number above 0, and finite", lambda x: 0.0 < x < math.inf, "reward_scale"),
-    ("0 or above", lambda x: 0.0 <= x < math.inf, "value_weight entropy_weight advantage_clip"),
-    ("0 or above", lambda x: 0.0 <= x < math.inf, "min_advantage_std shortest_episode"),
+    (*ABOVE, "learning_rate desired_kl clip max_gradient_norm reward_scale"),
+    (*LEAST, "value_weight entropy_weight advantage_clip min_advantage_std shortest_episode"),
     ("in [0, 2]", lambda x: 0.0 <= x <= 2.0, "noise_color"),
     ("finite", math.isfinite, "entropy_target"),
 )

@@ -1,6 +1,6 @@
 """The settings of PPO, by default the control suite's, and of its evaluation: checked data."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from purerl.ppo import checks
@@ -48,6 +48,9 @@ class Config:
     # Beyond it, a bonus only holds a hopper down.
     entropy_target: float = 0.3
     """Above this entropy there is no bonus [nats for each action]; a uniform policy has 0.69."""
+    auxiliary: dict[str, float | tuple[float, float, int]] = field(default_factory=dict, hash=False)
+    """Weights of the losses that the network names: a number each, or first, last, and the control
+    steps of the run in which the one becomes the other, linearly."""
     max_gradient_norm: float = 1.0
     """Gradients are scaled down to this global norm."""
     learning_rate: float = 1e-3

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from purerl.core.env import ABSURD, Env, State
+from purerl.core.keys import Purpose, derive, per_environment
 from purerl.core.records import Array, EpisodeStats, Network, PolicyOutput, PyTree, TrainState
 from purerl.ppo import running_moments
 from purerl.ppo.config import Config
@@ -56,8 +57,23 @@ def start_memory(memory: PyTree, num_episodes: int) -> PyTree:
     return jax.tree.map(lambda x: jnp.zeros((num_episodes, *x.shape[1:]), x.dtype), memory)
 
 
+def draw(network: Network, key: Array, env_ids: Array, *indices: Array) -> tuple:
+    """Returns the network's own noise as what `act` takes: (noise [B, ...],), or () if it has none.
+
+    Args:
+      network: the policy and value function.
+      key: [] typed, that `indices` of [] each are folded into.
+      env_ids: [B] int32.
+    """
+    # No key is made for others: what a loop over time does not read, it would compute all the same.
+    if network.draw is None:
+        return ()
+    keys = per_environment(derive(key, Purpose.NETWORK, *indices), env_ids)
+    return (jax.vmap(network.draw)(keys),)
+
+
 def act(
-    network: Network, state: TrainState, env_state: State, memory: PyTree
+    network: Network, state: TrainState, env_state: State, memory: PyTree, drawn: tuple = ()
 ) -> tuple[PolicyOutput, PyTree]:
     """Applies the network to the normalized observations of environments.
 
@@ -66,12 +82,13 @@ def act(
       state: for the parameters and the statistics of observations, both unbatched.
       env_state: [B, ...] what to look at.
       memory: [B, H] the policy's, before it looks.
+      drawn: its own noise, from `draw`; (): it acts by the mean.
 
     Returns:
       The policy's Gaussian [B, A] and the value [B], and the memory [B, H] that follows.
     """
     observation = running_moments.normalize(state.normalizer, env_state.observation)
-    return network.apply(state.params, observation, memory)
+    return network.apply(state.params, observation, memory, *drawn)
 
 
 def step_episodes(

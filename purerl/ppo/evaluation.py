@@ -54,15 +54,16 @@ def evaluate_policy(
     (4,)
     """
     reset_key, action_key = jax.random.split(key)
+    ids = jnp.arange(num_episodes)
 
     def step(progress: Progress) -> Progress:
-        output, memory = episodes.act(network, state, progress.env_state, progress.memory)
+        drawn = () if deterministic else episodes.draw(network, action_key, ids, progress.t)
+        output, memory = episodes.act(network, state, progress.env_state, progress.memory, drawn)
         raw = output.distribution.loc
         # White, whatever the color in training: what is asked is how the policy does, and the color
         # is a way to explore.
         if not deterministic:
-            step_key = jax.random.fold_in(action_key, progress.t)
-            noise = white(step_key, jnp.arange(num_episodes), env.action_size)
+            noise = white(jax.random.fold_in(action_key, progress.t), ids, env.action_size)
             raw = distributions.sample(output.distribution, noise)
         return advance(env, progress, distributions.to_action(raw), memory)
 

@@ -17,7 +17,7 @@ from purerl.core.records import Array, Metrics, Network, PolicyOutput, PyTree, T
 from purerl.ppo import distributions, episodes, losses
 from purerl.ppo.batches import Batch, in_one_row
 from purerl.ppo.config import Config
-from purerl.ppo.optimizer import next_rate, optimizer, scheduled_rate
+from purerl.ppo.optimizer import auxiliary_weights, next_rate, optimizer, scheduled_rate
 from purerl.ppo.running_moments import Moments, moments_of, pool
 
 
@@ -66,11 +66,12 @@ def learn(
     rate = scheduled_rate(config, state)
     learner = Learner(state.params, state.optimizer, rate, state.skipped_in_a_row)
     key = derive(state.key, Purpose.PERMUTATION, state.update)
+    weights = auxiliary_weights(config, state)
 
     def step(learner: Learner, chosen: tuple[Array, Moments]) -> tuple[Learner, Metrics]:
-        index, advantage_moments = chosen
+        index, moments = chosen
         minibatch, start = jax.vmap(take_columns)(batch, memory, index)
-        return minibatch_step(config, network, learner, minibatch, start, advantage_moments, parts)
+        return minibatch_step(config, network, weights, learner, minibatch, start, moments, parts)
 
     def epoch(learner: Learner, epoch_id: Array) -> tuple[Learner, Metrics]:
         epoch_key = jax.random.fold_in(key, epoch_id)
@@ -87,11 +88,9 @@ def learn(
         "learning_rate": learner.learning_rate,
         "parameter_norm": optax.tree.norm(learner.params),
     }
-    known = batch.old_value, batch.target, batch.valid
-    metrics["explained_variance"] = losses.explained_variance(*known, parts)
-    state = state.replace(params=learner.params, optimizer=learner.optimizer)
-    rate, in_a_row = learner.learning_rate, learner.skipped_in_a_row
-    return state.replace(learning_rate=rate, skipped_in_a_row=in_a_row), metrics
+    metrics |= {f"auxiliary/{name}_weight": x for name, x in weights.items()}
+    explained = losses.explained_variance(batch.value, batch.target, batch.valid, parts)
+    return state.replace(**learner._asdict()), metrics | {"explained_variance": explained}
 
 
 def take_columns(batch: Batch, memory: PyTree, index: Array) -> tuple[Batch, PyTree]:
@@ -162,18 +161,17 @@ def unroll(network: Network, params: PyTree, batch: Batch, memory: PyTree) -> Po
       Gaussians and values, [T', M, ...].
     """
     if not is_recurrent(memory):
-        output, _ = network.apply(params, batch.observation, memory)
-        return output
+        return network.apply(params, batch.observation, memory, *batch.drawn)[0]
 
     # Backpropagation through time reaches back to the rollout's first step and stops there: the
     # memory at that step is data, and of older parameters.
-    def step(memory: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, PolicyOutput]:
-        observation, is_first = row
+    def step(memory: PyTree, row: tuple[PyTree, Array, tuple]) -> tuple[PyTree, PolicyOutput]:
+        observation, is_first, drawn = row
         fresh = episodes.select(is_first, jax.tree.map(jnp.zeros_like, memory), memory)
-        output, memory = network.apply(params, observation, fresh)
+        output, memory = network.apply(params, observation, fresh, *drawn)
         return memory, output
 
-    _, outputs = jax.lax.scan(step, memory, (batch.observation, batch.is_first))
+    _, outputs = jax.lax.scan(step, memory, (batch.observation, batch.is_first, batch.drawn))
     return outputs
 
 
@@ -205,19 +203,17 @@ def loss(
     # Over all parts' samples, not this one's: so shares of a mean add up to the mean.
     count = jnp.maximum(advantage_moments.num_samples.astype(jnp.float32), 1.0)
     entropy, size = terms["entropy"], batch.raw_action.shape[-1]
+    terms |= {f"auxiliary/{name}": x for name, x in output.losses.items()}
     terms["bonus"] = losses.bounded_entropy(entropy, size, config.entropy_target)
     means = {k: jnp.where(batch.valid, x, 0.0).sum() / count for k, x in terms.items()}
-    objective = (
-        means["policy_loss"]
-        + config.value_weight * means["value_loss"]
-        - config.entropy_weight * means.pop("bonus")
-    )
-    return objective, means
+    objective = means["policy_loss"] + config.value_weight * means["value_loss"]
+    return objective - config.entropy_weight * means.pop("bonus"), means
 
 
 def minibatch_step(
     config: Config,
     network: Network,
+    weights: Metrics,
     learner: Learner,
     batch: Batch,
     memory: PyTree,
@@ -229,6 +225,7 @@ def minibatch_step(
     Args:
       config: the hyperparameters.
       network: the policy and value function.
+      weights: of the losses that it names, [] each.
       learner: before the step, unbatched.
       batch: [V, T', M, ...] the minibatch.
       memory: [V, M, H] at the rollout's start.
@@ -242,7 +239,10 @@ def minibatch_step(
     def gradient(batch: Batch, memory: PyTree) -> tuple[tuple[Array, Metrics], PyTree]:
         def objective(params: PyTree) -> tuple[Array, Metrics]:
             output = unroll(network, params, batch, memory)
-            return loss(config, output, advantage_moments, batch)
+            # Losses of the network's own are added here, since only it knows what they are of.
+            total, means = loss(config, output, advantage_moments, batch)
+            own = (weight * means[f"auxiliary/{name}"] for name, weight in weights.items())
+            return sum(own, total), means
 
         return jax.value_and_grad(objective, has_aux=True)(learner.params)
 
@@ -255,6 +255,7 @@ def minibatch_step(
     updates, optimizer_state = optimizer(config).update(gradients, learner.optimizer)
     # The rate is float32; parameters may have half of its precision, and keep their dtype.
     rate = learner.learning_rate
+    updates = network.scale(updates)
     stepped = jax.tree.map(lambda x, u: x - (rate * u).astype(x.dtype), learner.params, updates)
     new, old = (stepped, optimizer_state), (learner.params, learner.optimizer)
     params, optimizer_state = jax.tree.map(lambda x, y: jnp.where(sound, x, y), new, old)

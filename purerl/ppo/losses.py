@@ -70,7 +70,6 @@ def bounded_entropy(entropy: Array, action_size: int, target: float) -> Array:
       action_size: A.
       target: the entropy of an action beyond which more earns nothing [nats].
     """
-    chex.assert_type(entropy, float)
     mean = entropy / action_size  # a sum would outweigh what one action of many can earn
     # No squashed Gaussian has more than log 2, which is a uniform action's: the bound is idle.
     return mean if target >= math.log(2.0) else jnp.minimum(mean, target)
@@ -81,7 +80,6 @@ def approximate_kl(log_ratio: Array) -> Array:
 
     Schulman, "Approximating KL divergence" (2020), the estimator k3; `log_ratio` [...] is log r.
     """
-    chex.assert_type(log_ratio, float)
     return jnp.expm1(log_ratio) - log_ratio
 
 

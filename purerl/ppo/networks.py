@@ -165,6 +165,9 @@ def from_linen(module: nn.Module, observation: PyTree, memory: PyTree = ()) -> N
         `module(observation, memory) -> (PolicyOutput, memory)`. Leading axes are batch axes.
       observation: an example of one observation, leaves [O], unbatched (shapes only matter).
       memory: one environment's memory at the start of an episode, leaves [H], all zeros.
+
+    A network that draws noise of its own is made so: `from_linen(...)._replace(draw=draw)`. Its
+    module takes the noise as one more argument, or none where the policy acts by its mean.
     """
     # A module without a memory takes one argument and returns one thing, which is what most have.
     recurrent = len(jax.tree.leaves(memory)) > 0
@@ -175,9 +178,10 @@ def from_linen(module: nn.Module, observation: PyTree, memory: PyTree = ()) -> N
     def init(key: Array) -> tuple[PyTree, PyTree]:
         return module.init(key, *arguments), memory
 
-    def apply(params: PyTree, observation: PyTree, memory: PyTree) -> tuple[PolicyOutput, PyTree]:
+    def apply(params: PyTree, observation: PyTree, memory: PyTree, *noise: PyTree) -> tuple:
         stay = {k: jax.lax.stop_gradient(x) for k, x in params.items() if k != "params"}
-        output: Any = module.apply(params | stay, observation, *([memory] if recurrent else ()))
+        more = (memory, *noise) if recurrent else noise
+        output: Any = module.apply(params | stay, observation, *more)
         return output if recurrent else (output, memory)
 
     return Network(init=init, apply=apply)

@@ -58,8 +58,7 @@ def white(key: Array, env_ids: Array, size: int) -> Array:
       env_ids: [B] int32.
       size: A, features of an action.
     """
-    keys = per_environment(key, env_ids)
-    return jax.vmap(lambda key: jax.random.normal(key, (size,)))(keys)
+    return jax.vmap(lambda key: jax.random.normal(key, (size,)))(per_environment(key, env_ids))
 
 
 def coloring(length: int, exponent: float) -> np.ndarray:

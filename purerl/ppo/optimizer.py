@@ -9,7 +9,7 @@ change of schedule would change what a checkpoint holds.
 import jax.numpy as jnp
 import optax
 
-from purerl.core.records import Array, TrainState
+from purerl.core.records import Array, Metrics, TrainState, count_as_float
 from purerl.ppo.config import Config
 
 
@@ -34,6 +34,23 @@ def scheduled_rate(config: Config, state: TrainState) -> Array:
     # 1 at the first update and 1 / num_updates at the last: no update is made with a rate of 0.
     left = 1.0 - state.update.astype(jnp.float32) / config.num_updates
     return jnp.float32(config.learning_rate) * (left if config.schedule == "linear" else 1.0)
+
+
+def auxiliary_weights(config: Config, state: TrainState) -> Metrics:
+    """Returns the weights of the network's own losses in an update, name -> [].
+
+    Args:
+      config: the weights, and how they rise or fall.
+      state: for the control steps of the whole run so far, so that a resumed run has the same.
+    """
+
+    # Of steps, not of updates: another size of rollout leaves the ramp where it is.
+    def now(first: float, last: float, steps: int = 1) -> Array:
+        share = count_as_float(state.steps) / max(steps, 1)
+        return first + (last - first) * jnp.minimum(share, 1.0)
+
+    ramps = {k: (w, w) if isinstance(w, float | int) else w for k, w in config.auxiliary.items()}
+    return {name: now(*ramp) for name, ramp in ramps.items()}
 
 
 def next_rate(config: Config, rate: Array, kl: Array, sound: Array) -> Array:

@@ -24,6 +24,7 @@ class Transition(NamedTuple):
     # The Gaussian of the action's noise, given the noise of the steps before it; None: white noise,
     # whose Gaussian is the standard one.
     noise: Normal | None  # [..., A]
+    drawn: tuple  # (noise [..., ...],), the network's own; () of one that draws none
     log_prob: Array  # [...] of the raw action, under the policy that acted, with that noise
     value: Array  # [...] V(s_t)
     reward: Array  # [...] unscaled
@@ -90,14 +91,13 @@ def rollout(
     noise = action_noise(config, state, env.action_size)
 
     def step(now: RolloutState, t: Array) -> tuple[RolloutState, Transition]:
-        white, conditional = noise(t)
-        return _step(config, env, network, state, fresh, now, white, conditional)
+        drawn = episodes.draw(network, state.key, state.env_ids, state.update, t)
+        return _step(config, env, network, state, fresh, now, drawn, *noise(t))
 
     never = jnp.zeros(state.env_ids.shape, bool)
     nothing = episodes.episode_sums(state.episode, never, never)
-    start = RolloutState(
-        state.env_state, state.memory, state.episode, state.discounted_return, nothing
-    )
+    places = state.env_state, state.memory, state.episode, state.discounted_return
+    start = RolloutState(*places, nothing)
     # Parameters and statistics are those of `state` in every step: only `RolloutState` moves.
     end, transitions = jax.lax.scan(step, start, jnp.arange(config.rollout_length))
     output, _ = episodes.act(network, state, end.env_state, end.memory)
@@ -117,6 +117,7 @@ def _step(
     state: TrainState,
     fresh: State,
     now: RolloutState,
+    drawn: tuple,
     white: Array,
     noise: Normal | None,
 ) -> tuple[RolloutState, Transition]:
@@ -129,10 +130,11 @@ def _step(
       state: for the parameters and the statistics of observations, as they were before the rollout.
       fresh: [B, ...] replaces the states of episodes that end.
       now: [B, ...] before the step.
+      drawn: the network's own noise, from `episodes.draw`.
       white: [B, A] standard normal noise.
       noise: [B, A] the Gaussian that the action's noise has, as `Transition` has it.
     """
-    output, memory = episodes.act(network, state, now.env_state, now.memory)
+    output, memory = episodes.act(network, state, now.env_state, now.memory, drawn)
     distribution = distributions.given(output.distribution, noise)
     raw = distributions.sample(distribution, white)
     action = distributions.to_action(raw)
@@ -155,6 +157,7 @@ def _step(
         observation=observation,
         raw_action=raw,
         noise=noise,
+        drawn=drawn,
         log_prob=log_prob,
         value=jnp.where(lost & ~jnp.isfinite(output.value), 0.0, output.value),
         reward=reward,

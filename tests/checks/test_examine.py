@@ -467,7 +467,7 @@ def test_our_networks_are_well():
 
 
 def test_a_memory_that_never_changes():
-    init, apply = recurrent(RecurrentOptions(hidden=8), ONE, 2)
+    init, apply, *_ = recurrent(RecurrentOptions(hidden=8), ONE, 2)
 
     def forgetful(params, observation, carry):
         return apply(params, observation, carry)[0], carry

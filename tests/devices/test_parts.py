@@ -54,7 +54,7 @@ def gradient_step(recurrent, number, parts):
         size = pieces.valid.shape[2]
         order = jnp.tile(jnp.arange(size), (number, 1, 1))  # one minibatch of all columns
         scale = jax.tree.map(lambda x: x[0], learner.minibatch_moments(pieces, order, parts))
-        return learner.minibatch_step(config, network, begin, pieces, memories, scale, parts)
+        return learner.minibatch_step(config, network, {}, begin, pieces, memories, scale, parts)
 
     return step(state, cut(number, 1, batch), cut(number, 0, memory))
 
@@ -94,7 +94,7 @@ def test_advantages_of_a_minibatch_are_scaled_by_its_own(name):
     shape = (number, 1, 12)
     advantage = jax.random.normal(jax.random.key(0), shape) * 3.0 + 1.0
     valid = jax.random.bernoulli(jax.random.key(1), 0.8, shape)
-    batch = batches.Batch(*[advantage] * 9)._replace(valid=valid, noise=None)
+    batch = batches.Batch(*[advantage] * 10)._replace(valid=valid, noise=None, drawn=())
     order = learner.shuffle(jax.random.key(2), jnp.arange(number), 12, 3)
     found = learner.minibatch_moments(batch, order, parts)
     for k in range(3):
