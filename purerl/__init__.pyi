@@ -11,6 +11,7 @@ from purerl.report.video import frames as frames  # a run's policy, drawn
 
 # An experiment.
 from purerl.experiment.definition import Experiment as Experiment  # what is trained, and how
+from purerl.experiment.definition import Part as Part  # of a network: frozen, or of another run
 from purerl.experiment.loading import find as find  # an experiment by name, file or module
 from purerl.ppo.config import Config as Config  # the settings of PPO
 from purerl.ppo.config import Evaluation as Evaluation  # of the evaluations during training

@@ -28,8 +28,8 @@ def examine(network: Network, observation: PyTree) -> Iterator[Finding]:
     probe = jax.jit(_probe, static_argnums=0)
     answers, gradients = probe(network, params, inputs, memory)
     (_, following), moved = probe(network, _moved(params), inputs, memory)
-    _, scale, value = answers[0]
-    broken = [n for n, x in zip(("loc", "scale", "value"), answers[0], strict=True) if _bad(x)]
+    _, scale, value, *_ = answers[0]
+    broken = [n for n, x in zip(("loc", "scale", "value"), answers[0], strict=False) if _bad(x)]
     if broken:
         verb = "is" if len(broken) == 1 else "are"
         what = f"{some(broken)} {verb} not finite for observations of mean 0, std 1."
@@ -41,7 +41,8 @@ def examine(network: Network, observation: PyTree) -> Iterator[Finding]:
     yield ok("outputs", f"value {np.min(value):.2g} to {np.max(value):.2g}, finite")
     yield from _check_memory(memory, following)
     yield from _check_inputs(*moved[:2])
-    yield _check_parameters(gradients[2], moved[2])
+    rates = network.scale(jax.tree.map(jnp.ones_like, params))
+    yield _check_parameters(gradients[2], moved[2], rates)
 
 
 def _moved(params: PyTree) -> PyTree:
@@ -74,7 +75,7 @@ def _probe(network: Network, params: PyTree, inputs: PyTree, memory: PyTree) -> 
     def twice(params: PyTree, inputs: PyTree) -> tuple[Any, PyTree]:
         _, between = network.apply(params, inputs, memory)
         output, following = network.apply(params, inputs, between)
-        return (output.distribution.loc, output.distribution.scale, output.value), following
+        return (*output.distribution, output.value, *output.losses.values()), following
 
     def weighted(params: PyTree, inputs: PyTree, which: tuple[int, ...]) -> Array:
         found = twice(params, inputs)[0]
@@ -84,8 +85,9 @@ def _probe(network: Network, params: PyTree, inputs: PyTree, memory: PyTree) -> 
 
     by_inputs = jax.grad(weighted, argnums=1)
     of_value, of_policy = (by_inputs(params, inputs, which) for which in ((2,), (0, 1)))
-    of_parameters = jax.grad(weighted)(params, inputs, (0, 1, 2))
-    return twice(params, inputs), (of_value, of_policy, of_parameters)
+    found = twice(params, inputs)
+    of_parameters = jax.grad(weighted)(params, inputs, tuple(range(len(found[0]))))
+    return found, (of_value, of_policy, of_parameters)
 
 
 def trained(params: PyTree) -> PyTree:
@@ -126,13 +128,16 @@ def _observations(names: list[str]) -> str:
     return some([f"observation[{name!r}]" if name else "the observation" for name in names])
 
 
-def _check_parameters(gradients: PyTree, moved: PyTree) -> Finding:
-    """Tells which gradients are not finite at first, and which are zero after a step too."""
-    found, later = flatten(trained(gradients)), flatten(trained(moved))
+def _check_parameters(gradients: PyTree, moved: PyTree, rates: PyTree) -> Finding:
+    """Tells which gradients are not finite at first, and which are zero after a step too.
+
+    Those of rate 0 shall be: they are frozen.
+    """
+    found, later, rates = (flatten(trained(tree)) for tree in (gradients, moved, rates))
     broken = [name for name, x in found.items() if _bad(x)]
     if broken:
         return error("gradients", f"of {some(broken)} are not finite.")
-    idle = [name for name, x in later.items() if not x.any()]
+    idle = [name for name, x in later.items() if not x.any() and rates[name].any()]
     if idle:
         what = "has none: it is" if len(idle) == 1 else "have none: they are"
         return warning("gradients", f"{some(idle)} {what} never trained.")

@@ -27,9 +27,10 @@ def hash_held(env: Env, network: Network) -> dict[str, str]:
     env = without_engine(env)
 
     def call_all(key: Array, action: Array) -> PyTree:
-        one, other = jax.random.split(key)
+        one, other, third = jax.random.split(key, 3)
         state, (params, memory) = env.step(env.reset(one), action), network.init(other)
-        batch = jax.tree.map(lambda x: x[None], (state.observation, memory))
+        given = (state.observation, memory) + ((network.draw(third),) if network.draw else ())
+        batch = jax.tree.map(lambda x: x[None], given)
         return state, network.apply(params, *batch)
 
     traced = jax.make_jaxpr(call_all)(jax.random.key(0), jnp.zeros(env.action_size, jnp.float32))

@@ -4,11 +4,12 @@ Nothing heavy is imported here, so that a list of experiments or a help page com
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from purerl.core.errors import check_least
 from purerl.experiment.options import Engine
 from purerl.ppo.config import Config, Evaluation
 
@@ -17,6 +18,30 @@ if TYPE_CHECKING:
     from purerl.core.records import Network, PyTree
 else:  # the annotations are evaluated, to check settings, and these would import JAX
     Env = Network = PyTree = Any
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of the network: a subtree of its parameters, which learns or begins in its own way."""
+
+    rate: float = 1.0
+    """Factor on the learning rate of its parameters; 0: frozen."""
+    run: str = ""
+    """Folder of the run whose parameters it begins with; empty: they are drawn."""
+    checkpoint: str = "latest"
+    """Of that run: latest, best (highest evaluation return), or an update's number."""
+    reads: tuple[str, ...] | None = None
+    """Entries of the observation that it reads ("policy" where that is an array): their mean and
+    deviation are taken from that run too, and stay as they are."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a rate that is none, and for units that nobody has chosen."""
+        check_least(self, ValueError, rate=0)
+        if bool(self.run) != (self.reads is not None):
+            raise ValueError(
+                f"run is {self.run!r} and reads is {self.reads}; a part of another run needs both: "
+                'in reads the entries of the observation that it reads, such as ("policy",), or ().'
+            )
 
 
 @dataclass(frozen=True)
@@ -41,6 +66,7 @@ class Experiment:
         ),
     ] = "auto"
     evaluation: Evaluation = Evaluation()
+    parts: dict[str, Part] = field(default_factory=dict)  # name of a subtree of parameters -> how
 
 
 BUILDERS = ("build_env", "build_network")

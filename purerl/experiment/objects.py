@@ -15,8 +15,10 @@ from purerl.core.records import Network, PolicyOutput, PyTree
 from purerl.devices import memory, programs, threads
 from purerl.devices.check_sizes import check_minibatches
 from purerl.experiment import settings_json
-from purerl.experiment.definition import Experiment
+from purerl.experiment.definition import Experiment, Part
 from purerl.experiment.kinds import wrong_value
+from purerl.experiment.network_parts import with_parts
+from purerl.ppo import episodes
 from purerl.ppo.config import Config
 from purerl.ppo.learner import is_recurrent
 
@@ -57,8 +59,10 @@ def build(chosen: Experiment) -> Setup:
     with users_errors("build_network: "):
         network = chosen.build_network(chosen.network, zeros, env.action_size)
     with users_errors(""):
-        _check_network(network, zeros, env.action_size)
-    setup = Setup(chosen.ppo, env, in_float32(network), engine)
+        params, output = _check_network(network, zeros, env.action_size)
+        _check_weights(chosen.ppo.auxiliary, output.losses)
+        network = with_parts(in_float32(network), chosen.parts, params, zeros)
+    setup = Setup(chosen.ppo, env, network, engine)
     with users_errors(""), naming_broken_rules(env):
         # Sizes that do not fit together show here, in a second.
         abstract = programs.abstract_state(*setup[:3])
@@ -84,12 +88,17 @@ def check_acts(chosen: Experiment, before: dict[str, Any], env: Env, abstract: P
     def trace(settings: Any) -> Any:
         options = settings_json.from_json(chosen.network, settings)
         network = chosen.build_network(options, example, env.action_size)
-        return check_traces.trace_anew(network.apply, abstract.params, seen, abstract.memory)
+        more = episodes.draw(network, jax.random.key(0), jnp.arange(len(abstract.env_ids)))
+        return check_traces.trace_anew(network.apply, abstract.params, seen, abstract.memory, *more)
 
     now, old = settings_json.to_json(chosen.network), before["network"]
     idle = ["seed"] * (before["seed"] != chosen.seed)
     if chosen.ppo.schedule == "adaptive_kl":
         idle += ["ppo.learning_rate"] * (before["ppo"]["learning_rate"] != chosen.ppo.learning_rate)
+    then, drawn = before.get("parts", {}), settings_json.to_json(Part())
+    for name, part in settings_json.to_json(chosen.parts).items():
+        # A rate is in every update.
+        idle += [f"parts.{name}"] * (then.get(name, drawn) | {"rate": part["rate"]} != part)
     for name in now if isinstance(now, dict) and isinstance(old, dict) else ():
         if old.get(name, now[name]) != now[name]:
             with contextlib.suppress(Exception):  # the code of today refuses what was: it acts
@@ -125,15 +134,26 @@ def _check_jax() -> None:
         )
 
 
-def _check_network(network: Network, observation: PyTree, action_size: int) -> None:
-    """Raises ValueError unless a network's answers have the shapes that the trainer reads."""
+def _check_weights(weights: dict[str, Any], named: dict[str, Any]) -> None:
+    """Raises ValueError unless each loss that the network names has a weight, and no other."""
+    if weights.keys() != named.keys():
+        losses, weighed = (", ".join(sorted(names)) or "none" for names in (named, weights))
+        raise ValueError(
+            f"The network returns the losses: {losses}; ppo.auxiliary weighs: {weighed}. Give each "
+            "loss a weight, which may be 0, and take away those of no loss."
+        )
+
+
+def _check_network(network: Network, observation: PyTree, action_size: int) -> tuple[Any, Any]:
+    """Returns shapes of parameters and answers; ValueError unless the trainer can read them."""
     if not isinstance(network, Network):
         raise ValueError(
             f"build_network returned a {type(network).__name__}; it must return a "
             "purerl.Network(init, apply). Of a Flax module, networks.from_linen makes one."
         )
     check_takes("network.init", network.init, "key")
-    check_takes("network.apply", network.apply, "params", "observation", "memory")
+    given = ["params", "observation", "memory"] + ["noise"] * (network.draw is not None)
+    check_takes("network.apply", network.apply, *given)
     params, carry = _pair("init(key)", "parameters", network.init, jax.random.key(0))
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
@@ -144,8 +164,9 @@ def _check_network(network: Network, observation: PyTree, action_size: int) -> N
             )
     _check_memory_starts_at_zero(network, carry)
     two = jax.tree.map(lambda x: jax.ShapeDtypeStruct((2, *x.shape), x.dtype), (observation, carry))
-    said = "apply(params, observation, memory)"
-    output, following = _pair(said, "a purerl.PolicyOutput", network.apply, params, *two)
+    drawn = episodes.draw(network, jax.random.key(0), jnp.arange(2))
+    said = f"apply({', '.join(given)})"
+    output, following = _pair(said, "a purerl.PolicyOutput", network.apply, params, *two, *drawn)
     if not isinstance(output, PolicyOutput):
         raise ValueError(
             f"The network's `apply` returned a {type(output).__name__} and a memory; it must be "
@@ -153,8 +174,9 @@ def _check_network(network: Network, observation: PyTree, action_size: int) -> N
         )
     scalar, action = (2,), (2, action_size)
     normal = output.distribution
+    losses = [(f"loss {name}", x, scalar) for name, x in output.losses.items()]
     answers = [("loc", normal.loc, action), ("scale", normal.scale, action)]
-    for name, answer, shape in [*answers, ("value", output.value, scalar)]:
+    for name, answer, shape in [*answers, ("value", output.value, scalar), *losses]:
         if not jnp.issubdtype(answer.dtype, jnp.floating):
             raise ValueError(f"The network's {name} is {answer.dtype}; it must be float32.")
         if answer.shape != shape:
@@ -168,6 +190,7 @@ def _check_network(network: Network, observation: PyTree, action_size: int) -> N
             f"The network's memory goes in as {kinds[0]} and comes back as {kinds[1]}, for 2 "
             "environments; `apply` must return it as it was given, and `init` one environment's."
         )
+    return params, output
 
 
 def in_float32(network: Network) -> Network:
@@ -176,11 +199,11 @@ def in_float32(network: Network) -> Network:
     It may compute in half precision; its memory keeps the dtype that it has.
     """
 
-    def apply(params: PyTree, observation: PyTree, memory: PyTree) -> tuple[PolicyOutput, PyTree]:
-        output, memory = network.apply(params, observation, memory)
+    def apply(params: PyTree, *given: PyTree) -> tuple[PolicyOutput, PyTree]:
+        output, memory = network.apply(params, *given)
         return jax.tree.map(lambda x: x.astype(jnp.float32), output), memory
 
-    return Network(network.init, apply)
+    return network._replace(apply=apply)
 
 
 def _check_memory_starts_at_zero(network: Network, carry: PyTree) -> None:

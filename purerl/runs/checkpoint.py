@@ -77,9 +77,15 @@ def load_checkpoint(path: Path, abstract: PyTree, owners: Sequence[manifest.Owne
       UserError: it cannot be read, or it is whole, but another run's, or of another state than
         `abstract` (other sizes or networks).
     """
+    leaves, meta = load_leaves(path, abstract, owners)
+    return Saved(unflatten(leaves, abstract), meta)
+
+
+def load_leaves(path: Path, like: PyTree, owners: Any, ask: Callable = bool) -> tuple[Leaves, Any]:
+    """Reads the leaves to whose paths `ask` says yes (`bool`: to all); it raises what that does."""
     meta = checkpoint_folder.load_meta(path)
     manifest.check_owner(path, meta, owners)
-    wanted = _check_fits(path, meta, abstract)
+    wanted = _check_fits(path, meta, like, ask)
     checkpoint_folder.check_files(path, meta)
     leaves = {key: np.zeros(shape, np.dtype(dtype)) for key, (dtype, shape) in wanted.items()}
     try:
@@ -95,7 +101,7 @@ def load_checkpoint(path: Path, abstract: PyTree, owners: Sequence[manifest.Owne
             f"{one_line(error):.300}. Nothing was changed: mend the installation, the memory or "
             "the limits of this process."
         ) from error
-    return Saved(unflatten(leaves, abstract), meta)
+    return leaves, meta
 
 
 def newest(
@@ -147,7 +153,7 @@ def check_fits(folder: Path, updates: Sequence[int], abstract: PyTree) -> None:
     for update in reversed(updates):
         path = checkpoint_folder.path_of(folder, update)
         with contextlib.suppress(checkpoint_folder.DamagedError):
-            _check_fits(path, checkpoint_folder.load_meta(path), abstract)
+            _check_fits(path, checkpoint_folder.load_meta(path), abstract, bool)
             return
 
 
@@ -163,14 +169,14 @@ def _compare(leaves: Leaves, expected: dict[str, Any]) -> None:
             raise ValueError(f"leaf {key} comes back otherwise (sha256 differs)")
 
 
-def _check_fits(path: Path, meta: dict[str, Any], abstract: PyTree) -> dict[str, tuple]:
+def _check_fits(path: Path, meta: Any, abstract: PyTree, ask: Callable) -> dict[str, tuple]:
     """Returns each leaf's dtype and shape; UserError if those that were saved are others."""
     shapes = [(str(x.dtype), list(x.shape)) for x in jax.tree.leaves(jax.eval_shape(raw, abstract))]
-    wanted = dict(zip(leaf_paths(abstract), shapes, strict=True))
+    wanted = {k: x for k, x in zip(leaf_paths(abstract), shapes, strict=True) if ask(k)}
     stored = {
         key: (about["dtype"], about["shape"])
         for key, about in meta["leaves"].items()
-        if getattr(abstract, key.partition("/")[0], key) is not None  # None: left out
+        if ask(key) and getattr(abstract, key.partition("/")[0], key) is not None  # or left out
     }
     for key in sorted({*wanted, *stored}):
         if wanted.get(key) != stored.get(key):

@@ -11,7 +11,7 @@ from purerl.core.env import Env
 from purerl.core.errors import UserError
 from purerl.core.records import Array, Network, PyTree, TrainState
 from purerl.ppo import distributions, running_moments
-from purerl.ppo.episodes import start_memory
+from purerl.ppo.episodes import draw, start_memory
 
 
 class Policy:
@@ -37,7 +37,9 @@ class Policy:
 
         def act(state: TrainState, observation: PyTree, memory: PyTree, key: Any) -> Any:
             observation = running_moments.normalize(state.normalizer, observation)
-            output, memory = network.apply(state.params, observation, memory)
+            ids = jax.numpy.arange(len(jax.tree.leaves(observation)[0]))
+            drawn = () if key is None else draw(network, key, ids)
+            output, memory = network.apply(state.params, observation, memory, *drawn)
             raw = output.distribution.loc
             if key is not None:
                 raw = distributions.sample(output.distribution, jax.random.normal(key, raw.shape))

@@ -112,18 +112,24 @@ def _choose(run: Folder, update: str, abstract: TrainState, say: Say) -> checkpo
         if not whole:
             raise UserError(f"{run.path} has no whole checkpoint yet.")
         return whole[0]
-    number: int | str = update
+    path = find_checkpoint(run, update)
+    try:
+        return checkpoint.load_checkpoint(path, abstract, owners)
+    except checkpoint_folder.DamagedError as error:
+        raise UserError(f"The checkpoint {path} is damaged: {error}.") from error
+
+
+def find_checkpoint(run: Folder, update: str) -> Path:
+    """Returns the path of the checkpoint that is asked for, as `restore`; reads no array."""
+    folder = run.checkpoints
+    found = list(map(str, checkpoint_folder.updates(folder)))
+    number: int | str = (found or [update])[-1] if update == "latest" else update
     if update == "best":
         *_, (score, number) = [(-math.inf, 0), *checkpoint_folder.best_by_stage(folder).values()]
         if score == -math.inf:
             since = " since its last change" * bool(run.manifest.get("allowed_changes"))
             raise UserError(f"No checkpoint in {folder} was evaluated{since}; try latest.")
-    found = list(map(str, checkpoint_folder.updates(folder)))
     if str(number) not in found:
         valid = ", ".join(["latest", "best", *found])
         raise UserError(f"There is no checkpoint {update!r} in {folder}. Valid: {valid}.")
-    path = checkpoint_folder.path_of(folder, int(number))
-    try:
-        return checkpoint.load_checkpoint(path, abstract, owners)
-    except checkpoint_folder.DamagedError as error:
-        raise UserError(f"The checkpoint of update {number} is damaged: {error}.") from error
+    return checkpoint_folder.path_of(folder, int(number))

@@ -32,6 +32,7 @@ from purerl.ppo.algorithm import start_stage
 from purerl.runs import checkpoint, checkpoint_folder, manifest, resume
 from purerl.runs.folder import CHECKPOINTS, Folder, check_manifest, note
 from purerl.runs.metrics_file import MetricsFile, Record, keep_whole_lines
+from purerl.runs.taken_parts import put_in
 from purerl.training import console, loggers, loop
 from purerl.training.plan import Plan
 from purerl.training.writer import RunWriter
@@ -50,6 +51,7 @@ class Job(NamedTuple):
     plan: Plan
     facts: dict[str, Any]  # what manifest.json says of a run that begins now
     stop: Callable[[], bool]  # tells whether a signal asked to stop
+    taken: dict[str, Any] | None  # of other runs, for the first state; in the first process
     listener: Callable[[Record], Any] | None = None  # called with each line of metrics
 
 
@@ -171,7 +173,8 @@ def _first_state(
         return trees[0] if len(trees) == 1 else jax.tree.map(lambda *x: jnp.stack(x), *trees)
 
     if not found:
-        return programs.init(together([jax.random.key(seed.number) for seed in seeds]))
+        drawn = programs.init(together([jax.random.key(seed.number) for seed in seeds]))
+        return processes.state_of_first(put_in(drawn, job.taken or {}), job.abstract)
     state = together(list(map(_as_it_goes_on, seeds, saved))) if saved else None
     return processes.state_of_first(state, job.abstract)
 

@@ -30,6 +30,7 @@ from purerl.ppo.config import Config
 from purerl.ppo.learner import is_recurrent
 from purerl.runs import checkpoint, folder as run_folder, manifest, resume
 from purerl.runs.folder import Folder, check_manifest
+from purerl.runs.taken_parts import read_parts
 from purerl.training import console, loggers
 from purerl.training.plan import make_plan
 from purerl.training.seeds import Job, Seed, train_all
@@ -73,11 +74,22 @@ def prepare(
         setup = objects.build(chosen)
         abstract = programs.abstract_state(*setup[:3])
     begun_with = in_first_process(lambda: _shards_begun_with(found))
+    leaves, parts = kept_by_first(lambda: _taken(found, chosen, abstract)) or (None, None)
     shards = _choose_shards(setup.config, abstract, options, begun_with)
     objects.check_memory(setup, abstract, options.vmapped_seeds, shards.devices)
     plan = make_plan(setup.config, chosen.evaluation, options.checkpoints, options.log_every)
-    facts = _facts(source, chosen, options, setup, shards)
-    return Job(options, chosen, setup, abstract, shards, plan, facts, stop)
+    facts = _facts(source, chosen, options, setup, shards) | ({"parts": parts} if parts else {})
+    return Job(options, chosen, setup, abstract, shards, plan, facts, stop, leaves)
+
+
+def _taken(found: Sequence[Folder], chosen: Experiment, abstract: PyTree) -> tuple[Any, Any]:
+    """Returns what a run that begins takes of other runs, as `read_parts`.
+
+    One that goes on has it in its checkpoints, and reads no other run.
+    """
+    if found and all(folder.is_begun for folder in found):
+        return None, found[0].manifest.get("parts")
+    return read_parts(chosen.parts, abstract)
 
 
 def _shards_begun_with(found: Sequence[Folder]) -> int:

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from unittest import mock
 
 from purerl.__main__ import COMMANDS, module_of
-from purerl.experiment import options
+from purerl.experiment import definition, options
 from purerl.ppo import config, networks
 from tests.docs.blocks import ROOT
 from tests.mistakes.play import page as mistakes
@@ -39,6 +39,7 @@ TABLES = {
     "evaluation": (config.Evaluation, "Evaluations during training."),
     "network": (networks.MlpOptions, "Of `networks.mlp`."),
     "network ": (networks.RecurrentOptions, "Of `networks.recurrent`."),
+    "parts.NAME": (definition.Part, "[A part of the network](../howto/network_parts.md)."),
     "run": (options.RunOptions, "How a run is made, kept and shown: `--resume`, without a prefix."),
 }
 
@@ -50,6 +51,7 @@ def fields(record: type) -> Iterator[tuple[str, str, str]]:
         for field, comment in zip(body, body[1:], strict=False):
             if isinstance(field, ast.AnnAssign) and isinstance(comment, ast.Expr):
                 default = ast.unparse(field.value) if field.value else ""
+                default = "{}" if "default_factory=dict" in default else default
                 words = " ".join(inspect.cleandoc(comment.value.value).split())  # type: ignore
                 yield ast.unparse(field.target), default, words
 

@@ -1,0 +1,71 @@
+"""Parts of a network that begin as another run's: read from its checkpoint, put into a first state.
+
+No code of that run is executed: its checkpoint says which arrays it has, of which shapes.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from purerl.core.errors import UserError, unknown_name
+from purerl.core.records import Array, PyTree
+from purerl.experiment.definition import Part
+from purerl.experiment.network_parts import belongs, is_held, map_named, top_names
+from purerl.machine.state_arrays import Leaves, digest_leaves
+from purerl.runs import checkpoint, checkpoint_folder, manifest
+from purerl.runs.folder import check_manifest, read_run
+from purerl.runs.restored_run import find_checkpoint
+
+
+def read_parts(parts: Mapping[str, Part], abstract: PyTree) -> tuple[Leaves, dict[str, Any]]:
+    """Returns the arrays that a new run takes over, and what its manifest says of them.
+
+    Args:
+      parts: name -> settings; those without a run are drawn, as all others.
+      abstract: shapes of the new run's state.
+
+    Raises:
+      UserError: there is no such run or checkpoint, or it has not what is asked for.
+    """
+    leaves, facts = Leaves(), dict[str, Any]()
+    for name, part in ((name, part) for name, part in parts.items() if part.run):
+        found, facts[name] = _read(name, part, abstract)
+        twice = [key for key in found if (found[key] != leaves.get(key, found[key])).any()]
+        if twice:
+            raise UserError(f"parts.{name}: {twice[0]} is another in the run of a part before it.")
+        leaves |= found
+    return leaves, facts
+
+
+def _read(name: str, part: Part, abstract: PyTree) -> tuple[Leaves, dict[str, Any]]:
+    """Returns one part's arrays, and the statistics that it reads by; and whose they are."""
+    run = read_run(Path(part.run))
+    path, owners = find_checkpoint(run, part.checkpoint), manifest.owners(check_manifest(run))
+
+    def asked(key: str) -> bool:
+        field, _, inner = key.partition("/")
+        of_part = field == "params" and belongs(inner, name)
+        return of_part or (field == "normalizer" and is_held(inner, part.reads))
+
+    try:
+        stored = checkpoint_folder.load_meta(path)["leaves"]
+        there = [key.removeprefix("params/") for key in stored if key.startswith("params/")]
+        if not any(belongs(key, name) for key in there):
+            raise UserError(unknown_name("part", name, top_names(there), f" in {run.path}"))
+        leaves, meta = checkpoint.load_leaves(path, abstract, owners, asked)
+    except checkpoint_folder.DamagedError as error:
+        raise UserError(f"The checkpoint {path} is damaged: {error}.") from error
+    facts = {"run": run.manifest["run_id"], "update": meta["update"]}
+    return leaves, facts | {"sha256": digest_leaves(leaves)}
+
+
+def put_in(state: PyTree, leaves: Leaves) -> PyTree:
+    """Returns a first state with `leaves` for what was drawn; of vmapped seeds for each."""
+
+    def one(path: str, x: Array) -> Array:
+        return jnp.array(np.broadcast_to(leaves[path], x.shape)) if path in leaves else x
+
+    return map_named(one, state)

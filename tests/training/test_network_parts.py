@@ -1,0 +1,206 @@
+"""A part of a network that is another run's: frozen or not, in its units, without its folder."""
+
+import contextlib
+import json
+import shutil
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from purerl import run
+from purerl.checks import examine_network
+from purerl.core.errors import INTERRUPTED, SUCCESS, USAGE, UserError
+from purerl.devices.programs import abstract_state
+from purerl.experiment import objects
+from purerl.experiment.definition import Part
+from purerl.machine import array_files
+from purerl.machine.state_arrays import flatten
+from purerl.runs import checkpoint_folder, taken_parts
+from purerl.runs.loaded_run import load
+from purerl.training import train
+from tests.experiment.test_resumed_settings import refusal
+from tests.runs import coded_experiment
+from tests.training.test_run import Stopper
+
+pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly", "programs_are_kept")
+
+CODED = coded_experiment.__file__
+RATES = ["--parts.decoder.rate", "0"]
+
+
+def start(runs, *words):
+    return run.main([CODED, "--runs", str(runs), "--checkpoints", "4", *words])
+
+
+def place(runs, name="seed1"):
+    return runs / "coded_experiment" / name
+
+
+def taking(old, reads="policy"):
+    return [*RATES, "--parts.decoder.run", str(old), "--parts.decoder.reads", reads]
+
+
+def saved(folder):
+    """Returns the arrays of the newest checkpoint by their paths."""
+    path = sorted((folder / "checkpoints").iterdir())[-1]
+    meta = checkpoint_folder.load_meta(path)
+    like = {k: np.zeros(x["shape"], x["dtype"]) for k, x in meta["leaves"].items()}
+    return array_files.read(path / "state", {k: x for k, x in like.items() if x.size})
+
+
+def told(runs, name="seed1"):
+    text = (place(runs, name) / "metrics.jsonl").read_text()
+    return [{**json.loads(line), "wall_s": 0} for line in text.splitlines()]
+
+
+@pytest.fixture(scope="module")
+def old(tmp_path_factory):
+    runs = tmp_path_factory.mktemp("old")
+    assert start(runs) == SUCCESS
+    return place(runs)
+
+
+@pytest.fixture(scope="module")
+def whole(old, tmp_path_factory):
+    """A run with the old one's decoder, frozen, that nobody disturbed."""
+    runs = tmp_path_factory.mktemp("whole")
+    assert start(runs, *taking(old)) == SUCCESS
+    return runs
+
+
+def test_a_frozen_part_is_the_other_runs_to_the_bit_and_the_rest_moves(old, whole):
+    before, after = saved(old), saved(place(whole))
+    decoder = {k for k in after if "/decoder/" in k}
+    params = {k for k in after if k.startswith("params/")}
+    assert len(decoder & params) == 4
+    for name in params:
+        assert (before[name] == after[name]).all() == (name in decoder), name
+    for name in {k for k in after if k.startswith("optimizer/") and "/params/" in k}:
+        assert after[name].any() == (name not in decoder), name
+    for name in (k for k in after if k.startswith("normalizer/")):
+        assert (before[name] == after[name]).all(), name  # the counts are equal too: as many steps
+
+
+def test_the_manifest_says_whose_part_it_is(old, whole):
+    facts = json.loads((place(whole) / "manifest.json").read_text())["parts"]["decoder"]
+    theirs = json.loads((old / "manifest.json").read_text())
+    assert facts["run"] == theirs["run_id"] and facts["update"] == 12
+    assert len(facts["sha256"]) == 64
+
+
+def test_losses_and_weights_are_logged_by_name(whole):
+    line = told(whole)[-1]
+    for name in ("code_kl", "sparsity", "prediction"):
+        assert np.isfinite(line[f"train/auxiliary/{name}"])
+    assert line["train/auxiliary/prediction_weight"] == 1.0
+    weights = [line["train/auxiliary/code_kl_weight"] for line in told(whole)]
+    assert weights[0] == 0.0 and weights[3] == pytest.approx(0.1 * 96 / 200)
+
+
+def test_a_killed_run_goes_on_without_the_other_run(old, whole, tmp_path, monkeypatch, capsys):
+    copy = shutil.copytree(old, tmp_path / "gone")
+
+    @contextlib.contextmanager
+    def signals(_):
+        yield Stopper(5)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(train.signals, "stop_signals", signals)
+        assert start(tmp_path, *taking(copy)) == INTERRUPTED
+    shutil.rmtree(copy)
+    assert start(tmp_path, "--resume") == SUCCESS, capsys.readouterr().err
+    assert told(tmp_path)[-1]["digest"] == told(whole)[-1]["digest"]
+    policy, seen = load(place(tmp_path), trust=True).policy, np.ones((2, 1))
+    by_mean, drawn = policy(seen), [policy(seen, jax.random.key(1)) for _ in range(2)]
+    assert by_mean[0] == by_mean[1] and drawn[0][0] != drawn[0][1]
+    np.testing.assert_array_equal(*drawn)
+
+
+def test_mapped_seeds_are_single_runs(old, whole, tmp_path):
+    assert start(tmp_path, *taking(old), "--num-seeds", "2", "--seeds-by", "map") == SUCCESS
+    assert told(tmp_path)[-1]["digest"] == told(whole)[-1]["digest"]
+
+
+def test_each_vmapped_seed_begins_with_the_part():
+    drawn = {"params": {"decoder": np.zeros((2, 3)), "encoder": np.zeros((2, 3))}}
+    begun = taken_parts.put_in(drawn, {"params/decoder": np.arange(3.0)})["params"]
+    np.testing.assert_array_equal(begun["decoder"], [np.arange(3.0)] * 2)
+    assert not begun["encoder"].any()
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--parts.decoder.checkpoint", "7"], "There is no checkpoint '7' in "),
+        (["--network.decoder", "5"], "leaf params/params/decoder/Dense_0/kernel is ['float32', [8, "
+         "1]] in it and ['float32', [5, 1]] in this experiment."),
+        (["--parts.decoder.run", "nowhere"], "nowhere"),
+        (["--parts.decoder.reads", "eyes"], "There is no entry of the observation 'eyes'. There "
+         "are: policy."),
+    ],
+)  # fmt: skip
+def test_what_the_other_run_has_not_is_one_line(old, tmp_path, capsys, words, says):
+    assert start(tmp_path, *taking(old), *words) == USAGE
+    said = capsys.readouterr().err
+    assert says in said and len(said.splitlines()) == 1, said
+    assert not place(tmp_path).exists()
+
+
+def test_the_parts_that_the_other_run_has_are_named(old):
+    abstract = abstract_state(*objects.build(coded_experiment.experiment)[:3])
+    with pytest.raises(UserError, match="no part 'muscles' in .* There are: critic, decoder, enc"):
+        taken_parts.read_parts({"muscles": Part(run=str(old), reads=())}, abstract)
+
+
+def test_a_part_of_another_run_needs_its_units():
+    for wrong in ({"run": "runs/a"}, {"reads": ("policy",)}):
+        with pytest.raises(ValueError, match="a part of another run needs both"):
+            Part(**wrong)
+
+
+def test_one_entry_has_the_units_of_one_run(old):
+    abstract = abstract_state(*objects.build(coded_experiment.experiment)[:3])
+    both = {"decoder": Part(run=str(old), reads=("policy",)), "guess": Part(run=str(old), reads=())}
+    leaves, facts = taken_parts.read_parts(both, abstract)
+    assert facts.keys() == both.keys() and {k.split("/")[0] for k in leaves} == {
+        "normalizer",
+        "params",
+    }
+    both["guess"] = Part(run=str(old), checkpoint="9", reads=("policy",))
+    with pytest.raises(UserError, match="parts.guess: normalizer/mean/.* is another in"):
+        taken_parts.read_parts(both, abstract)
+
+
+def test_a_rate_of_its_own_is_of_its_parameters_alone():
+    one = objects.build(replace(coded_experiment.experiment, parts={"decoder": Part(rate=0.25)}))
+    params = jax.eval_shape(one.network.init, jax.random.key(0))[0]
+    scaled = flatten(one.network.scale(jax.tree.map(lambda x: np.ones(x.shape), params)))
+    assert len(scaled) == 10
+    for name, x in scaled.items():
+        assert (x == (0.25 if "/decoder/" in name else 1.0)).all(), name
+
+
+@pytest.mark.parametrize(
+    ("part", "refused"),
+    [
+        (Part(rate=0.0), ""),
+        (Part(run="other", reads=()), "parts.decoder"),
+        (Part(run="old", reads=("policy",)), "parts.decoder"),
+    ],
+)
+def test_a_run_that_goes_on_takes_no_other_part(part, refused):
+    begun = replace(coded_experiment.experiment, parts={"decoder": Part(run="old", reads=())})
+    drawn = replace(begun, parts={})
+    assert refusal(drawn, parts={"decoder": part}) == refused
+    kept = replace(part, run="old", reads=()) if not refused else part
+    assert refusal(begun, parts={"decoder": kept}) == refused
+
+
+def test_check_does_not_warn_of_what_shall_be_frozen():
+    """Nor of parameters that only a loss of the network's own trains."""
+    frozen = replace(coded_experiment.experiment, parts={"decoder": Part(rate=0.0)})
+    seen = np.random.default_rng(0).normal(size=(8, 1)).astype(np.float32)
+    *_, last = examine_network.examine(objects.build(frozen).network, seen)
+    assert last.text == "each of 10 parameters has one"
