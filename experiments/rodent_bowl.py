@@ -1,6 +1,9 @@
 """dm_control's rodent climbs out of a bowl of bumps that differ in every episode.
 
 python -m purerl.run rodent_bowl
+
+Expected: after 3 M steps, 17 min on four CPU cores, it gets up from any fall and is 1.2 m from the
+middle on average: 195 of 1000 (one seed), and rising. Out of the bowl are 6 m: not trained so far.
 """
 
 import dataclasses

@@ -1,6 +1,9 @@
-"""dm_control's rodent runs along a corridor of gaps that nothing tells it of: it has to see.
+"""dm_control's rodent runs along a corridor of gaps that it has to see.
 
-python -m purerl.run rodent_gaps_eyes --engine warp --num-seeds 3
+python -m purerl.run rodent_gaps_eyes --engine warp --num-seeds 2
+
+Expected: 4 to 5 gaps in 10 s after 21 M steps, 15 min on an H200 (two seeds). There the told one of
+`rodent_gaps` is then, too, and crosses 17 after 28 M. By sight it was not trained as long.
 """
 
 import dataclasses

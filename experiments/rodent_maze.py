@@ -1,6 +1,8 @@
 """dm_control's rodent finds treats in a maze that differs in every episode, by sight.
 
 python -m purerl.run rodent_maze --engine warp
+
+After 0.8 M steps it finds 0.4 of 12 treats; not trained further.
 """
 
 import dataclasses
