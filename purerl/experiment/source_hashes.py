@@ -13,7 +13,7 @@ import os
 import sys
 import sysconfig
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -66,22 +66,25 @@ def hash_code(text: bytes) -> str:
         tree = ast.parse(text)
     except (SyntaxError, ValueError):
         return hashlib.sha256(text).hexdigest()
-    return hashlib.sha256("\n".join(_meaning(tree)).encode()).hexdigest()
+    parts: list[str] = []
+    _say(tree, parts.append)
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
-def _meaning(node: ast.AST) -> Iterator[str]:
-    """Yields what a syntax tree says, part by part, without docstrings and messages of errors."""
-    yield type(node).__name__
+def _say(node: ast.AST, say: Callable[[str], None]) -> None:
+    """Says what a syntax tree means, part by part, without docstrings and messages of errors."""
+    # Not a generator: each part would pass through one for each level of the tree.
+    say(type(node).__name__)
     silent = {ast.Raise: ("exc", "cause"), ast.Assert: ("msg",)}.get(type(node), ())
     for name in node._fields:
         value = getattr(node, name, None) if name not in silent else None
         for part in value if isinstance(value, list) else [value]:
             if isinstance(part, ast.AST) and not _is_text(part):
-                yield f"{name}("
-                yield from _meaning(part)
-                yield ")"
+                say(f"{name}(")
+                _say(part, say)
+                say(")")
             elif part is not None and not isinstance(part, ast.AST):
-                yield f"{name}={part!r}"
+                say(f"{name}={part!r}")
 
 
 def _is_text(node: ast.AST) -> bool:
