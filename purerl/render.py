@@ -1,6 +1,7 @@
 """Makes a video of a run's policy: `python -m purerl.render RUN [--checkpoint best]`.
 
-RUN is a run's folder. RUN/videos/<update>.mp4 shows the deterministic policy in real time, in each
+RUN is a run's folder, or a policy that comes with purerl, as `ant_gaps`, whose videos go to
+videos/ant_gaps/. RUN/videos/<update>.mp4 shows the deterministic policy in real time, in each
 episode's own geometry; <update>.png beside it shows 16 moments of it. No screen is needed.
 """
 

@@ -1,7 +1,8 @@
 """Opens a window on a run or an experiment: `python -m purerl.view EXPERIMENT_OR_RUN`.
 
 A page in the browser in which a run's policy drives the body, live; an experiment's body, the
-planner. Sliders change the numbers of the environment's options, which begin as they are given:
+planner. `ant_gaps` and other policies that come with purerl are played by their names. Sliders
+change the numbers of the environment's options, which begin as they are given:
 
     python -m purerl.view suite --env.task hopper-hop
 
@@ -37,7 +38,7 @@ class ViewOptions(PlanOptions):
 
 def command(words: Sequence[str]) -> None:
     """Opens the page and plays until Ctrl-C."""
-    found = find(words, PROG)
+    found = find(words, PROG, policies=True)
     prog = f"{PROG} {shlex.quote(found.name)}"
     chosen, options = settings_of(found, words[1:], prog, ViewOptions)
     command_errors.check_installed("viser", "view")  # its help needs no window

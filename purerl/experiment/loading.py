@@ -21,6 +21,8 @@ from purerl.ppo.config import Config, Evaluation
 OURS_BESIDE = ("envs", "experiments")  # packages of ours; without `purerl.`, a person's own
 # The library's own experiments: in a clone the folder beside `purerl/`, where a link leads.
 OURS = (Path(__file__).parents[1] / "experiments").resolve()
+# Policies that come with the library: trimmed folders of runs, each named as it is played.
+POLICIES = (Path(__file__).parents[1] / "assets" / "policies").resolve()
 
 
 class Source(NamedTuple):
@@ -97,6 +99,22 @@ def find_source(name: str) -> Source:
         raise UserError(f"{name} is no Python file; an experiment is one, as {like}.py.")
     places = f" in {' or '.join(map(str, _folders()))}"
     raise UserError(unknown_name("experiment", name, named, places))
+
+
+def shipped(name: str) -> Path | None:
+    """Returns the folder of a policy that comes with the library; None if there is none.
+
+    What is the user's own goes before: a folder of that name here, or an experiment.
+    """
+    place = {place.name: place for place in POLICIES.glob("*")}.get(name)
+    if place is None or Path(name).is_dir():
+        return None
+    return place if available().get(name, OURS / name).parent == OURS else None
+
+
+def is_shipped(folder: Path) -> bool:
+    """Tells whether a run's folder is one of the library's: nothing is written into it."""
+    return folder.resolve().parent == POLICIES
 
 
 def load_file(

@@ -1,9 +1,10 @@
 """Which experiments' code is known to this user on this machine, and may be executed from a run.
 
 A run's folder holds a copy of its experiment, and may come from a stranger. The copy is executed if
-the same bytes stand in `experiments/`, or in the list that this module keeps: of every experiment
-that this user has trained, and of every one that they vouched for by `--trust`. What the folder
-says of itself counts for nothing: a stranger writes its manifest too.
+the same bytes stand in `experiments/`, beside a policy that comes with the library, or in the list
+that this module keeps: of every experiment that this user has trained, and of every one that they
+vouched for by `--trust`. What the folder says of itself counts for nothing: a stranger writes its
+manifest too.
 """
 
 import contextlib
@@ -50,8 +51,11 @@ def load_copy(copy: Path, text: bytes, name: str, original: Path, trust: bool) -
 
 def known_places(text: bytes, name: str) -> list[Path]:
     """Returns the files whose code is known to be `text`; of named experiments, that of `name`."""
-    named = loading.available().get(name)
-    found = [named] if named is not None and named.read_bytes() == text else []
+    ours = [
+        *loading.POLICIES.glob("*/experiment.py"),
+        *filter(None, [loading.available().get(name)]),
+    ]
+    found = [file for file in ours if file.read_bytes() == text]
     wanted = hashlib.sha256(text).hexdigest()
     for line in _lines():
         with contextlib.suppress(ValueError, TypeError):

@@ -12,6 +12,7 @@ from PIL import Image
 
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.keys import Purpose, derive
+from purerl.experiment import loading
 from purerl.experiment.options import check_seed
 from purerl.machine.files import check_inside
 from purerl.report import run_reader
@@ -31,7 +32,7 @@ def make_video(
     """Plays episodes by the deterministic policy, and writes a video and a contact sheet of them.
 
     Args:
-      run: the run; the files go to its folder's videos/.
+      run: the run; the files go to `videos_of` its folder.
       camera: a camera's name or number in the model; "": one that follows the body.
       episodes: how many, one after the other.
       seconds: at most so much of each [s].
@@ -94,7 +95,12 @@ def frames(
 
 
 def videos_of(folder: Path) -> Path:
-    """Returns the folder of a run's videos; UserError if it is a link to elsewhere."""
+    """Returns the folder of a run's videos; UserError if it is a link to elsewhere.
+
+    Of a policy that comes with the library it is videos/NAME in the folder of the process.
+    """
+    if loading.is_shipped(folder):
+        return Path("videos", folder.name)
     check_inside(folder, folder / "videos")
     return folder / "videos"
 
@@ -156,7 +162,7 @@ def _write_files(
     """Writes a video of `number` frames and, beside it, its contact sheet; each whole or not."""
     drafts = {kind: path.with_name(f".{path.stem}{kind}") for kind in (".png", ".mp4")}
     try:
-        path.parent.mkdir(exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         for draft in drafts.values():  # it may be a link, to be written through
             draft.unlink(missing_ok=True)
         _write_video(drafts[".mp4"], frames, number, size, fps).save(drafts[".png"])

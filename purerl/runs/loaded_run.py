@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
 from purerl.core.errors import UserError
+from purerl.experiment import loading
 from purerl.runs.folder import METRICS, check_is_run
 from purerl.runs.metrics_file import deviation, read_metrics
 
@@ -28,7 +29,8 @@ def load(
     known on this machine, as of a run trained here, or with `trust` (docs/reference/trust.md).
 
     Args:
-      folder: the run's folder, such as "runs/ant_run/seed1".
+      folder: the run's folder, such as "runs/ant_run/seed1", or the name of a policy that comes
+        with purerl, such as "ant_gaps".
       checkpoint: "latest", "best" (highest evaluation return), or an update's number.
       engine: a physics engine, where it should not be the run's own.
       trust: the code in the folder may be executed, though this machine does not know it.
@@ -43,7 +45,7 @@ def load(
     >>> run.metrics()["update"][-1]
     2
     """
-    folder = Path(folder)
+    folder = loading.shipped(str(folder)) or Path(folder)
     check_is_run(folder)
     return Run(folder, str(checkpoint), engine, trust)
 
@@ -98,7 +100,9 @@ class Run:
         from purerl.runs.restored_run import restore
 
         set_up_jax(cache=True)
-        return restore(self.folder, self.checkpoint, show, self.engine, self.trust)
+        # The code that a shipped policy comes with is its own, though it has changed since.
+        say = (lambda line: None) if loading.is_shipped(self.folder) else show
+        return restore(self.folder, self.checkpoint, say, self.engine, self.trust)
 
     @functools.cached_property
     def policy(self) -> "Policy":

@@ -57,8 +57,13 @@ def show_help(base: Any, about: str | None, prog: str, words: Sequence[str]) -> 
         parse(base, ["--help"], prog)
 
 
-def find(words: Sequence[str], prog: str) -> Subject:
+def find(words: Sequence[str], prog: str, policies: bool = False) -> Subject:
     """Finds what the first of the words names.
+
+    Args:
+      words: the command line.
+      prog: the command before it, for errors.
+      policies: whether a name may mean a policy that comes with purerl, rather than the experiment.
 
     Raises:
       UserError: there is no such experiment or run.
@@ -66,7 +71,7 @@ def find(words: Sequence[str], prog: str) -> Subject:
     if not words or words[0].startswith("-"):
         raise UserError(f"The first word must be an experiment or a run: {prog} EXPERIMENT_OR_RUN")
     name = words[0]
-    if not Path(name).is_dir():
+    if not (Path(name).is_dir() or policies and loading.shipped(name)):
         return Subject(name, loading.find_source(name), None)
     # Options that say how to read the run, whose experiment says which other options there are.
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
@@ -78,7 +83,7 @@ def find(words: Sequence[str], prog: str) -> Subject:
     except argparse.ArgumentError as error:
         raise UserError(f"The command line is wrong: {error}.") from error
     run = loaded_run.load(name, known.checkpoint, known.engine, known.trust)
-    return Subject(name, loading.Source(run.experiment, name, Path(name) / folder.CODE), run)
+    return Subject(name, loading.Source(run.experiment, name, run.folder / folder.CODE), run)
 
 
 def chosen(

@@ -65,6 +65,7 @@ BODIES = (
     "assets/cartpole.xml",
     *(f"experiment/templates/{x}" for x in ("body.xml", "train.sbatch")),
 )
+POLICIES = [x for x in (ROOT / "assets" / "policies").rglob("*") if x.is_file()]
 TOP_LEVEL = """
 import importlib.metadata, json, pathlib, site
 (packages,) = site.getsitepackages()
@@ -216,7 +217,15 @@ def build(place: Place) -> tuple[Path, Path]:
 def contents(wheel: Path) -> str:
     """Checks what is in the wheel and what is not."""
     names = zipfile.ZipFile(wheel).namelist()
-    for name in ("__init__.pyi", "py.typed", "envs/run.py", "experiments/ant_run.py", *BODIES):
+    shipped = [str(file.relative_to(ROOT)) for file in POLICIES]
+    for name in (
+        "__init__.pyi",
+        "py.typed",
+        "envs/run.py",
+        "experiments/ant_run.py",
+        *BODIES,
+        *shipped,
+    ):
         need(f"purerl/{name}" in names, f"{wheel.name} lacks purerl/{name}")
     ours = re.compile(r"purerl(/|-[\w.]+\.dist-info/)")
     odd = [name for name in names if not ours.match(name) or re.search("benchmarks/|peers/", name)]
@@ -310,6 +319,8 @@ def commands(place: Place, here: Path, whole: bool) -> Iterator[str]:
     said = purerl(place, here, "run --help")
     need("cartpole_swingup" in said and "ant_run" in said, f"run --help lists: {said}")
     purerl(place, here, "check cartpole_swingup")
+    said = purerl(place, here, "evaluate cartpole_swingup --episodes 4")
+    need(re.search(r"episode_return +9[34]\d\.", said), f"the shipped policy reaches: {said}")
     (here / "typing_extensions.py").unlink()  # below, `-m` looks here first: Python's own rule
     said = purerl(place, here, "run cartpole_swingup --name a" + ("" if whole else f" {FEW}"))
     last = float(re.findall(r"evaluation: return (-?[\d.]+)", said)[-1])
