@@ -80,7 +80,8 @@ def test_view_plays_it_and_plan_does_not(elsewhere):
     assert source.words(session.numbers) == "--env.velocity-scale 4.0"
     assert source.command(session.numbers).startswith(f"python -m purerl.run {ONE} --env.")
     assert subject.find([ONE], "python -m purerl.plan").run is None
-    assert subject.find(["suite"], view.PROG, policies=True).run is None
+    for name in ("suite", f"purerl.experiments.{ONE}"):
+        assert subject.find([name], view.PROG, policies=True).run is None
 
 
 def test_what_is_the_users_own_goes_before(elsewhere):
