@@ -24,7 +24,6 @@ from typing import Any
 
 from purerl.core.errors import RunError, UserError
 from purerl.experiment import loading, settings_json
-from purerl.experiment.definition import Experiment
 from purerl.machine import array_files, files
 from purerl.machine.command_errors import leave
 from purerl.machine.state_arrays import flatten
@@ -33,12 +32,14 @@ from purerl.runs.folder import CHECKPOINTS, CODE, CONFIG, MANIFEST, METRICS, Fol
 from purerl.runs.metrics_file import read_metrics
 from purerl.tune.overrides import option_words
 
-RETURN, TRAINED = "eval/episode_return", "train/episode_return"
+RETURN = "eval/episode_return"
 KEPT = re.compile(r"update|steps|wall_s|eval/.*|train/episode_(return|length)")
 LINES = 48  # of metrics.jsonl, besides the evaluations
 BARS = "▁▂▃▄▅▆▇█"
 COLUMNS = 16  # of the curve in the table
-HEAD = "| play | trained by | steps, on | return | curve | digest |\n|---|---|---|---|---|---|\n"
+HEAD = (
+    "| play | trained by | steps, on | return | evaluations | digest |\n|---|---|---|---|---|---|\n"
+)
 TABLE = re.compile(re.escape(HEAD) + r"(?:\|.*\n)*")
 # A folder's name from the root on. What stands before it in a text is no part of a word.
 ABSOLUTE = re.compile(rb"(?:^|[\s\"'=:(\[])(/(?:\w[\w.+-]*/)+)")
@@ -113,24 +114,26 @@ def row(config: Path) -> str:
     meta = checkpoint_folder.load_meta(checkpoint_folder.path_of(folder.checkpoints, update))
     device, lines = folder.manifest["device"], read_metrics(folder.metrics)
     where = f"{device['kind']}, {device['threads']} threads"
-    *_, last = [x for x in lines if RETURN in x]
-    reached = f"{last[RETURN]:,.0f} ± {last[f'{RETURN}_std']:,.0f}"
+    evaluated = [x for x in lines if RETURN in x]
+    reached = f"{evaluated[-1][RETURN]:,.0f} ± {evaluated[-1][f'{RETURN}_std']:,.0f}"
     cells = (
         f"`python -m purerl.view {folder.path.name}`",
         f"`{training_command(folder)}`",
         f"{meta['steps'] / 1e6:.1f} M, {where}, {meta['wall_s'] / 60:.1f} min",
         reached,
-        curve([x[TRAINED] for x in lines if x.get(TRAINED) is not None]),
+        curve([x[RETURN] for x in evaluated]),
         f"`{meta['digest']}`",
     )
     return f"| {' | '.join(cells)} |\n"
 
 
 def training_command(folder: Folder) -> str:
-    """Returns the command that trains a run again: its settings beside those of its file."""
+    """Returns the command that trains a run again: its settings beside the experiment's own."""
     name = folder.config["experiment"]
-    written: Experiment = loading.load_file(folder.path / CODE, name, folder.code).experiment
-    chosen = settings_json.from_json(written, folder.config["settings"])
+    written = loading.find(name)
+    settings = settings_json.to_json(written)
+    settings = restored_run.fill(folder.config["settings"], settings, lambda line: None)
+    chosen = settings_json.from_json(written, settings)
     values = settings_json.settings_of(chosen).items()
     words = [w for n, v in values for w in option_words(n, getattr(written, n), v)]
     return " ".join(["python -m purerl.run", name, *words])

@@ -37,7 +37,7 @@ class PlayOptions:
     """Which run's policy is played, from which checkpoint, and where."""
 
     run: Annotated[Path, tyro.conf.Positional]
-    """The run's folder, such as runs/ant_run/seed1, or a policy that purerl brings: ant_gaps."""
+    """The run's folder, such as runs/ant_run/seed1, or ant_gaps, which comes with purerl."""
     checkpoint: str = "latest"
     """latest, best (highest evaluation return), or an update's number."""
     seed: int = 0

@@ -46,7 +46,7 @@ def restore(
     begun = check_manifest(run)
     original = Path(begun["experiment_file"]).absolute()
     source = load_copy(run.path / CODE, run.code, run.config["experiment"], original, trust)
-    settings = _fill(run.config["settings"], settings_json.to_json(source.experiment), say)
+    settings = fill(run.config["settings"], settings_json.to_json(source.experiment), say)
     settings |= {"engine": engine} if engine else {}
     chosen = settings_json.from_json(source.experiment, settings)
     try:
@@ -95,13 +95,13 @@ def _changed_since(begun: dict[str, Any], source: loading.Source, setup: Setup) 
     return found
 
 
-def _fill(old: Any, new: Any, say: Say, path: str = "") -> Any:
+def fill(old: Any, new: Any, say: Say, path: str = "") -> Any:
     """Returns the settings `old` of a run, and from `new` those that the code got since then."""
     if not (isinstance(old, dict) and isinstance(new, dict)):
         return old
     for name in new.keys() - old.keys():
         say(f"{CONFIG} lacks {path}{name}; it is taken as {new[name]}.")
-    return new | {name: _fill(old[name], new.get(name), say, f"{path}{name}.") for name in old}
+    return new | {name: fill(old[name], new.get(name), say, f"{path}{name}.") for name in old}
 
 
 def _choose(run: Folder, update: str, abstract: TrainState, say: Say) -> checkpoint.Saved:

@@ -15,7 +15,7 @@ from purerl.experiment import loading, trust
 from purerl.experiments.benchmarks import policies
 from purerl.machine import files
 from purerl.report.video import videos_of
-from purerl.runs import checkpoint_folder
+from purerl.runs import checkpoint_folder, restored_run
 from purerl.runs.folder import read_run
 from purerl.tune import subject
 from tests.docs.blocks import ROOT
@@ -45,7 +45,8 @@ def own_experiment(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_it_opens_in_silence_and_acts(name, elsewhere, capsys):
+def test_it_opens_in_silence_and_acts(name, elsewhere, capsys, monkeypatch):
+    monkeypatch.setattr(restored_run, "_changed_since", lambda *_: ["The code"])
     run = purerl.load(name)
     action = run.policy(jax.jit(run.env.reset)(jax.random.key(0)).observation)
     assert action.shape == (run.env.action_size,) and np.isfinite(action).all()
