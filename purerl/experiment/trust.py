@@ -51,11 +51,8 @@ def load_copy(copy: Path, text: bytes, name: str, original: Path, trust: bool) -
 
 def known_places(text: bytes, name: str) -> list[Path]:
     """Returns the files whose code is known to be `text`; of named experiments, that of `name`."""
-    ours = [
-        *loading.POLICIES.glob("*/experiment.py"),
-        *filter(None, [loading.available().get(name)]),
-    ]
-    found = [file for file in ours if file.read_bytes() == text]
+    ours = [*loading.POLICIES.glob("*/experiment.py"), loading.available().get(name)]
+    found = [file for file in ours if file is not None and file.read_bytes() == text]
     wanted = hashlib.sha256(text).hexdigest()
     for line in _lines():
         with contextlib.suppress(ValueError, TypeError):
