@@ -42,7 +42,8 @@ HEAD = (
 )
 TABLE = re.compile(re.escape(HEAD) + r"(?:\|.*\n)*")
 # A folder's name from the root on. What stands before it in a text is no part of a word.
-ABSOLUTE = re.compile(rb"(?:^|[\s\"'=:(\[])(/(?:\w[\w.+-]*/)+)")
+# Of two letters at least: arrays have shorter ones by chance.
+ABSOLUTE = re.compile(rb"(?:^|[\s\"'=:(\[])(/(?:\w[\w.+-]+/)+)")
 
 
 # --- the folder ---
@@ -113,7 +114,7 @@ def row(config: Path) -> str:
     (update,) = folder.updates
     meta = checkpoint_folder.load_meta(checkpoint_folder.path_of(folder.checkpoints, update))
     device, lines = folder.manifest["device"], read_metrics(folder.metrics)
-    where = f"{device['kind']}, {device['threads']} threads"
+    where = device["kind"] + (f", {n} threads" if (n := device.get("threads")) else "")
     evaluated = [x for x in lines if RETURN in x]
     reached = f"{evaluated[-1][RETURN]:,.0f} ± {evaluated[-1][f'{RETURN}_std']:,.0f}"
     cells = (
