@@ -42,8 +42,8 @@ HEAD = (
 )
 TABLE = re.compile(re.escape(HEAD) + r"(?:\|.*\n)*")
 # A folder's name from the root on. What stands before it in a text is no part of a word.
-# Of two letters at least: arrays have shorter ones by chance.
-ABSOLUTE = re.compile(rb"(?:^|[\s\"'=:(\[])(/(?:\w[\w.+-]+/)+)")
+# The first of two letters at least: arrays have shorter ones by chance.
+ABSOLUTE = re.compile(rb"(?:^|[\s\"'=:(\[])(/\w[\w.+-]+/(?:\w[\w.+-]*/)*)")
 
 
 # --- the folder ---
