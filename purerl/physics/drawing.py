@@ -116,6 +116,20 @@ def add_scenery(scene: mujoco.MjvScene, scenery: tuple[Array, ...]) -> None:
         scene.ngeom += 1
 
 
+def color_of(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """Returns a geom's color [4]: its own, else its material's, and of a texture the mean."""
+    material, own = model.geom_matid[geom], model.geom_rgba[geom]
+    if material < 0 or not np.allclose(own, [0.5, 0.5, 0.5, 1.0]):
+        return own
+    color, texture = model.mat_rgba[material], model.mat_texid[material].max()
+    if texture < 0 or model.tex_nchannel[texture] < 3:
+        return color
+    start, depth = model.tex_adr[texture], model.tex_nchannel[texture]
+    size = model.tex_height[texture] * model.tex_width[texture] * depth
+    pixels = model.tex_data[start : start + size].reshape(-1, depth)
+    return np.append(color[:3] * pixels[:, :3].mean(0) / 255.0, color[3])
+
+
 def find_camera(model: mujoco.MjModel, camera: str) -> int:
     """Returns the id of a camera by its name or its number; ValueError if there is none."""
     numbers = {str(i): i for i in range(model.ncam)}

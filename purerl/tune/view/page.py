@@ -24,11 +24,6 @@ MOVES = {"Step": events.step, "Next episode": events.next_episode}
 WAYS = {"forward": (1, 0, 0), "back": (-1, 0, 0), "left": (0, 1, 0), "right": (0, -1, 0),
         "up": (0, 0, 1)}  # fmt: skip
 COLORS = ("#222222", "#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b")
-PLOTS = {
-    "Reward per step": readouts.reward_plot,
-    "Value": readouts.value_plot,
-    "Actions": readouts.action_plot,
-}
 AS_IN_FILE = "# as in the experiment's file"  # as high as the overrides of one slider
 PLOT_HEIGHT, PANEL_WIDTH, EYES_WIDTH = 190, 380, 320  # [pixels]
 MOST_EVENTS = 1000  # that wait to be played
@@ -41,7 +36,7 @@ class Page:
         """Opens the page's server; port 0 is any free one."""
         self.events: queue.SimpleQueue[Any] = queue.SimpleQueue()
         key = secrets.token_urlsafe(16)
-        opened = gate.closed(key, self._find, lambda why: self.put(events.refuse, why))
+        opened = gate.closed(key, self._find, lambda why: self.put(events.change, "trouble", why))
         with contextlib.redirect_stdout(io.StringIO()), opened:  # viser prints a banner
             self.server = viser.ViserServer(host, port, label=title, verbose=False)
         self.port = self.server.get_port()
@@ -51,7 +46,6 @@ class Page:
         self.sliders: dict[Place, Any] = {}
         self.numbers: dict[Place, Any] = {}  # as the sliders have told them
         self.plots: dict[str, Any] = {}
-        self.names: dict[str, tuple[str, ...]] = {}  # of each plot's lines
         self.checkpoints: Any = None
         self.eyes: Any = None
 
@@ -90,7 +84,7 @@ class Page:
         moves.on_click(lambda _: put(MOVES[moves.value]))
         hint = "Simulated seconds in a real one"
         speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1", hint=hint)
-        speed.on_update(lambda _: put(events.speed, float(speed.value)))
+        speed.on_update(lambda _: put(events.change, "speed", float(speed.value)))
         follow = gui.add_checkbox("Camera follows", True)
         follow.on_update(lambda _: setattr(self.scene, "follows", follow.value))
         shadows = gui.add_checkbox("Shadows", True, hint="Without: faster where there is no GPU")
@@ -100,7 +94,8 @@ class Page:
         if checkpoints:
             names, first = tuple(checkpoints), checkpoints[0]
             self.checkpoints = gui.add_dropdown("Checkpoint", names, initial_value=first)
-            self.checkpoints.on_update(lambda _: put(events.choose, self.checkpoints.value))
+            chosen = self.checkpoints
+            chosen.on_update(lambda _: put(events.change, "chosen", chosen.value))
         self._add_sliders(session)
         self._add_push()
         self._add_plots()
@@ -201,22 +196,21 @@ class Page:
 
     def _draw_plots(self, session: Session) -> None:
         """Draws the lines; with fewer than two points uPlot has no scale, and they stay."""
-        for title, plot_of in PLOTS.items():
-            plot = plot_of(session)
+        for title, plot in readouts.plots(session).items():
             if len(plot.columns[0]) < 2:
                 continue
-            if title in self.plots:
-                self.plots[title].data = plot.columns
-                if self.names[title] != plot.names:
-                    self.plots[title].series = _series(plot.names)
-            else:
+            series = _series(plot.names)
+            if title not in self.plots:
                 with self.tab:
                     self.plots[title] = self.server.gui.add_uplot(
-                        data=plot.columns, series=_series(plot.names), title=title,
+                        data=plot.columns, series=series, title=title,
                         height=PLOT_HEIGHT, scales={"x": {"time": False}},
                         legend={"show": len(plot.names) <= len(COLORS)},
                     )  # fmt: skip
-            self.names[title] = plot.names
+            shown = self.plots[title]
+            shown.data = plot.columns
+            if shown.series != series:
+                shown.series = series
 
 
 def _series(names: Sequence[str]) -> tuple[Any, ...]:

@@ -93,7 +93,7 @@ class Scene:
     def _dragged(self, batch: shapes.Batch, event: Any) -> None:
         """Tells that the mouse draws at a part of a body, or lets it go."""
         if event.phase == "end":
-            self.put(events.release)
+            self.put(events.change, "grip", None)
             return
         start, end = (np.array(p) + self.offset for p in (event.start_position, event.end_position))
         geom = batch.geoms[(event.instance_index or 0) % len(batch.geoms)]
