@@ -183,7 +183,6 @@ def _series_data(
 def _media(folders: Sequence[Path]) -> list[Html]:
     room, parts = page_media.LARGEST_PAGE, list[Html]()
     for folder in folders:
-        media = page_media.read_media(folder, room)
-        room = media.room
-        parts += page_media.media_elements(folder.name, media)
+        more, room = page_media.media_elements(folder, room)
+        parts += more
     return [element("div", join(parts), class_="pictures")] if parts else []
