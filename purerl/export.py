@@ -10,13 +10,10 @@ actions are from the run's own is printed.
 """
 
 import importlib
-import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import purerl
-from purerl.core.errors import UserError
 from purerl.experiment.command_line import main_of
 from purerl.experiment.options import PlayOptions
 from purerl.machine import command_errors, files, output
@@ -50,10 +47,8 @@ def command(options: ExportOptions) -> None:
 
 def writer(name: str) -> Any:
     """Returns the function that writes a format: only what it needs is imported."""
-    missing = [package for package in NEEDS[name] if importlib.util.find_spec(package) is None]
-    if missing:
-        line = purerl.how_to_install("export")
-        raise UserError(f"--format {name} needs {', '.join(missing)}: {line}")
+    for package in NEEDS[name]:
+        command_errors.check_installed(package, "export")
     return getattr(importlib.import_module(f"purerl.report.policy_{name}"), f"write_{name}")
 
 

@@ -72,13 +72,10 @@ def _document(title: str, body: Sequence[Html], data: Html) -> str:
         element("title", title),
         element("style", style),
     )
-    inside = element("body", *map(_sendable, (*body, data)), element("script", script))
+    # Without the folders of absolute paths, which are nobody else's business.
+    sent = [Html(FOLDERS.sub(lambda found: found[1] or "", part)) for part in (*body, data)]
+    inside = element("body", *sent, element("script", script))
     return f"<!DOCTYPE html>\n{element('html', head, inside, lang='en')}\n"
-
-
-def _sendable(part: Html) -> Html:
-    """Returns a part without the folders of absolute paths, which are nobody else's business."""
-    return Html(FOLDERS.sub(lambda found: found[1] or "", part))
 
 
 def _digest(content: str) -> str:

@@ -40,7 +40,7 @@ class Scene:
         self.world = self.server.scene.add_frame(WORLD, show_axes=False)
         self.stage = Stage(session.program.env.physics.model)
         self.model, self.data = model, _ = self.stage.model, self.stage.data
-        shapes.pose(self.stage, session.picture)
+        self.stage.pose(session.picture)
         self.batches = shapes.batches(model)
         self.drawn = {n: shapes.layout(model, self.data, b) for n, b in self.batches.items()}
         self.handles = {name: self._add_batch(name) for name in self.batches}
@@ -62,7 +62,7 @@ class Scene:
         if session.picture is self.seen:
             return
         self.seen = session.picture
-        shapes.pose(self.stage, session.picture)
+        self.stage.pose(session.picture)
         with self.server.atomic():
             for name, batch in self.batches.items():
                 where = shapes.layout(self.model, self.data, batch)

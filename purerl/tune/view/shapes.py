@@ -57,13 +57,6 @@ class Layout(NamedTuple):
     scales: np.ndarray  # [N, 3]
 
 
-def pose(stage: renderer.Stage, picture: episode_pictures.Picture) -> None:
-    """Puts a stage's model into the place and form of a picture."""
-    stage.put(picture)
-    mujoco.mj_kinematics(stage.model, stage.data)
-    mujoco.mj_comPos(stage.model, stage.data)
-
-
 def batches(model: mujoco.MjModel) -> dict[str, Batch]:
     """Returns a model's visible geoms as batches, by name; planes and height fields are none."""
     found: dict[str, Batch] = {}
@@ -83,7 +76,7 @@ def batches(model: mujoco.MjModel) -> dict[str, Batch]:
 
 
 def layout(model: mujoco.MjModel, data: mujoco.MjData, batch: Batch) -> Layout:
-    """Returns where a batch's parts are in a model that `pose` has put into place."""
+    """Returns where a batch's parts are in a model that a `Stage` has put into place."""
     geoms, size = batch.geoms, model.geom_size[batch.geoms]
     rotations = data.geom_xmat[geoms].reshape(-1, 3, 3)
     along = (batch.sides * size[:, 1])[:, None] * rotations[:, :, 2]
