@@ -22,7 +22,8 @@ LARGE = 1e4  # std beyond which a unit is probably wrong
 
 def examine(env: Env, num_steps: int = NUM_STEPS) -> Iterator[Finding]:
     """Yields what is found of an environment, the cheapest first; stops where it cannot go on."""
-    before = _members(env)
+    held = getattr(env, "__dict__", {})
+    before = dict(held)
     reasons.said.clear()
     try:
         check_env.check_shapes(env)
@@ -30,7 +31,7 @@ def examine(env: Env, num_steps: int = NUM_STEPS) -> Iterator[Finding]:
         yield error("protocol", one_line(broken))
         return
     yield ok("protocol", "names, shapes and dtypes")
-    changed = sorted(n for n, x in _members(env).items() if before.get(n, env) is not x)
+    changed = sorted(n for n, x in held.items() if before.get(n, env) is not x)
     if changed:
         what = f"reset or step sets env.{changed[0]}, and a compiled program does so only once"
         yield error("own state", f"{what}: what an episode must remember goes into State.task.")
@@ -72,10 +73,6 @@ def first_state(start: State) -> list[Finding]:
     found = [check_keys(start)] if size > 1 else []
     found += _ended(np.asarray(start.terminated))
     return [one for one in found if one.level != "ok"]
-
-
-def _members(env: Env) -> dict[str, Any]:
-    return dict(getattr(env, "__dict__", {}))
 
 
 def _told(about: str, good: str, bad: Callable, check: Callable, *arguments: Any) -> Finding:

@@ -63,8 +63,10 @@ def step_calls(env: Any, state: State, action: Array) -> list[Call]:
     return calls
 
 
-def check_controls(env: Any, trial: Trial) -> list[Finding]:
+def check_controls(env: Any, trial: Trial) -> Iterator[Finding]:
     """Warns of controls that MuJoCo clamps: what lies beyond is an action without effect."""
+    from purerl.physics import lookup
+
     model = env.physics.model
 
     def controls(state: State, action: Array) -> list[Array]:
@@ -76,24 +78,20 @@ def check_controls(env: Any, trial: Trial) -> list[Finding]:
         batch = jax.jit(jax.vmap(jax.vmap(controls, (0, 0)), (None, 0)))
         given = [np.asarray(x) for x in batch(trial.start, trial.actions)]
     except Exception:  # a trace of the user's own around the physics
-        return []
-    return [_describe_controls(model, np.stack(given))] if given and model.nu else []
-
-
-def _describe_controls(model: Any, given: np.ndarray) -> Finding:
-    """Compares controls [..., nu] with the range of each actuator."""
-    from purerl.physics import lookup
-
-    flat = given.reshape(-1, model.nu)
+        return
+    if not given or not model.nu:
+        return
+    flat = np.stack(given).reshape(-1, model.nu)
     least, most = flat.min(0), flat.max(0)
     low, high = model.actuator_ctrlrange.T
     slack = TINY * np.maximum(high - low, 1.0)
     over = model.actuator_ctrllimited.astype(bool) & ((least < low - slack) | (most > high + slack))
     names = lookup.names(model, "actuator")
     if not over.any():
-        return ok("controls", f"of {model.nu} actuators, none beyond its ctrlrange")
+        yield ok("controls", f"of {model.nu} actuators, none beyond its ctrlrange")
+        return
     i = int(np.argmax(over))
-    return warning(
+    yield warning(
         "controls",
         f"{over.sum()} of {model.nu} actuators are driven beyond their ctrlrange, where MuJoCo "
         f"clamps: {names[i] or i} gets {least[i]:.3g} to {most[i]:.3g}, and has {low[i]:.3g} to "

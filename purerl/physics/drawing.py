@@ -64,22 +64,18 @@ class Stage:
         """Lets the camera take its height and distance anew."""
         self.followed_height = None
 
-    def put(self, picture: Picture) -> None:
-        """Writes a picture, given as numpy arrays, into model and data; computes nothing."""
+    def pose(self, picture: Picture) -> None:
+        """Puts everything where it is in a picture of numpy arrays, and aims the camera.
+
+        The camera points at the followed body, or where the model has it.
+        """
         for name, values in picture.changes.items():
             getattr(self.model, name)[...] = values
         self.data.qpos[:] = picture.qpos
         self.data.mocap_pos[:] = picture.mocap_pos
         self.data.mocap_quat[:] = picture.mocap_quat
 
-    def pose(self, picture: Picture) -> None:
-        """Puts everything where it is in a picture, and aims the camera."""
-        self.put(picture)
         mujoco.mj_fwdPosition(self.model, self.data)
-        self._aim()
-
-    def _aim(self) -> None:
-        """Points the camera at the followed body, or leaves it to the model."""
         if self.fixed is not None:
             self.camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
             self.camera.fixedcamid = self.fixed

@@ -38,13 +38,15 @@ def make_page(runs: Sequence[run_reader.RunRecord], group_by: Sequence[str] = ()
     sections = page_series.panels(groups)
     experiments = list(dict.fromkeys(run.settings["experiment"] for run in runs))
     title = f"{', '.join(experiments)}: {len(runs)} run{'s' * (len(runs) > 1)}"
+    more = len(page_series.metric_names(runs)) - page_series.MOST_PANELS
+    said = f"{more:,} more metrics have no chart: a page takes {page_series.MOST_PANELS}."
     body = [
         element("h1", title),
         *_section("Runs", page_tables.runs_table(runs)),
         *_section("Scores", *page_tables.scores(result)),
         _controls(groups),
         *_charts(sections, len(groups) > 1),
-        *_unseen(runs),
+        *([element("p", said, class_="note")] if more > 0 else []),
         *_section("Last evaluation of each run", page_tables.evaluations(runs)),
         *_section("Settings", *page_tables.settings(runs, result)),
         *_section("Videos", *_media(folders)),
@@ -132,13 +134,6 @@ def _charts(sections: Sequence[tuple[str, list[page_series.Panel]]], several: bo
         if wide:
             parts.append(element("p", BANDS, class_="note"))
     return parts
-
-
-def _unseen(runs: Sequence[run_reader.RunRecord]) -> list[Html]:
-    """Returns a line about metrics that have no chart; empty where all have."""
-    more = len(page_series.metric_names(runs)) - page_series.MOST_PANELS
-    said = f"{more:,} more metrics have no chart: a page takes {page_series.MOST_PANELS}."
-    return [element("p", said, class_="note")] if more > 0 else []
 
 
 BANDS = (

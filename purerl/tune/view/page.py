@@ -70,7 +70,7 @@ class Page:
         """Returns the events since the last call."""
         return [self.events.get() for _ in range(self.events.qsize())]
 
-    def build(self, session: Session, checkpoints: Sequence[str]) -> None:
+    def build(self, session: Session, checkpoints: Sequence[str], train: Callable[[], str]) -> None:
         """Adds everything that a person moves and reads.
 
         Args:
@@ -88,7 +88,8 @@ class Page:
         follow = gui.add_checkbox("Camera follows", True)
         follow.on_update(lambda _: setattr(self.scene, "follows", follow.value))
         shadows = gui.add_checkbox("Shadows", True, hint="Without: faster where there is no GPU")
-        shadows.on_update(lambda _: self.scene.cast_shadows(shadows.value))
+        light = self.server.scene.configure_default_lights
+        shadows.on_update(lambda _: light(cast_shadow=shadows.value))
         seed = gui.add_number("Seed", session.seed, min=0, max=2**32 - 1, step=1)
         seed.on_update(lambda _: put(events.seed, int(seed.value)))
         if checkpoints:
@@ -96,7 +97,7 @@ class Page:
             self.checkpoints = gui.add_dropdown("Checkpoint", names, initial_value=first)
             chosen = self.checkpoints
             chosen.on_update(lambda _: put(events.change, "chosen", chosen.value))
-        self._add_sliders(session)
+        self._add_sliders(session, train)
         self._add_push()
         self._add_plots()
 
@@ -111,12 +112,18 @@ class Page:
                 x, y, z = (hard.value * part for part in WAYS[way.value])
                 self.put(events.push, (x, y, z))
 
-    def _add_sliders(self, session: Session) -> None:
+    def _add_sliders(self, session: Session, train: Callable[[], str]) -> None:
         gui, live = self.server.gui, session.program.live
         with gui.add_folder("Options of the environment"):
             self.words = gui.add_html("This environment's options have no numbers.")
-            self.train = gui.add_button("Train this", hint="Shows the command that trains it")
-            self.command = gui.add_html("", visible=False)
+            button = gui.add_button("Train this", hint="Shows the command that trains it")
+            told = gui.add_html("", visible=False)
+
+            @button.on_click
+            def _(_: Any) -> None:
+                _show(told, readouts.as_typed(train()))
+                told.visible = True
+
             for place in live:
                 self._add_slider(place, session.numbers[place], "acts at once")
         others = [place for place in session.numbers if place not in live]
@@ -147,14 +154,6 @@ class Page:
         self.server.gui.main_panel.dock_right()
         panel.dock_left()
         panel.set_width(PANEL_WIDTH)
-
-    def on_train(self, command: Callable[[], str]) -> None:
-        """Shows a command when it is asked for."""
-
-        @self.train.on_click
-        def _(_: Any) -> None:
-            _show(self.command, readouts.as_typed(command()))
-            self.command.visible = True
 
     def set_sliders(self, numbers: dict[Place, Any]) -> None:
         """Sets the sliders back to the numbers that are in use."""

@@ -28,10 +28,6 @@ class Scene:
         self.world: Any = None
         self.seen: Any = None  # the picture that is drawn
 
-    def cast_shadows(self, on: bool) -> None:
-        """Switches shadows, half of the work of a browser that draws without a GPU."""
-        self.server.scene.configure_default_lights(cast_shadow=on)
-
     def show(self, session: Session) -> None:
         """Draws a program's model anew; the camera stands as it did, if there was one."""
         first = self.world is None
