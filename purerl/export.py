@@ -10,13 +10,10 @@ actions are from the run's own is printed.
 """
 
 import importlib
-import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import purerl
-from purerl.core.errors import UserError
 from purerl.experiment.command_line import main_of
 from purerl.experiment.options import PlayOptions
 from purerl.machine import command_errors, files, output
@@ -41,20 +38,13 @@ def command(options: ExportOptions) -> None:
 
     file = options.out or Path(f"policy.{options.format}")
     files.check_writable(file)
-    write = writer(options.format)
+    for package in NEEDS[options.format]:
+        command_errors.check_installed(package, "export")
+    module = importlib.import_module(f"purerl.report.policy_{options.format}")
     run = load(options.run, options.checkpoint, options.engine, options.trust)
-    policy = write(run, file)
+    policy = getattr(module, f"write_{options.format}")(run, file)
     output.show(record_episodes(run, options.seed).compare(policy))
     output.show(f"{file} ({file.stat().st_size:,} bytes)")
-
-
-def writer(name: str) -> Any:
-    """Returns the function that writes a format: only what it needs is imported."""
-    missing = [package for package in NEEDS[name] if importlib.util.find_spec(package) is None]
-    if missing:
-        line = purerl.how_to_install("export")
-        raise UserError(f"--format {name} needs {', '.join(missing)}: {line}")
-    return getattr(importlib.import_module(f"purerl.report.policy_{name}"), f"write_{name}")
 
 
 main = main_of(ExportOptions, command, "python -m purerl.export")

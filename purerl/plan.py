@@ -33,6 +33,7 @@ def command(words: Sequence[str]) -> None:
     from purerl.devices.compilation import set_up_jax
     from purerl.machine.files import write_answer
     from purerl.machine.signals import stop_signals
+    from purerl.machine.state_arrays import digest_leaves, flatten
     from purerl.report.opengl import choose_gl
     from purerl.training.train import set_xla_flags_in_time
     from purerl.tune.plan import figures
@@ -56,7 +57,8 @@ def command(words: Sequence[str]) -> None:
             played[one.title] = play(one, options, judges, stop)
     groups = {name: figures.compared(x.figures, x.judged) for name, x in played.items()}
     said = figures.table(groups) + figures.notes({n: x.figures for n, x in played.items()})
-    if second is not None and not same(*(x.starts for x in played.values())):
+    starts = {digest_leaves(flatten(x.starts)) for x in played.values()}
+    if second is not None and len(starts) > 1:
         said.append(
             "The two settings begin their episodes otherwise: what differs is not their rewards' "
             "doing alone."
@@ -78,13 +80,6 @@ def titles(problems: Sequence[Any]) -> list[str]:
         file = "as in the experiment's file"
         return [f"{one.title}: {one.words or file}" for one in problems]
     return [f"{one.name}, {one.trained}" for one in problems if one.trained]
-
-
-def same(some: Any, others: Any) -> bool:
-    """Tells whether two trees of arrays are equal, in structure too."""
-    from purerl.machine.state_arrays import digest_leaves, flatten
-
-    return digest_leaves(flatten(some)) == digest_leaves(flatten(others))
 
 
 main = main_of_words(command, show_help)

@@ -145,7 +145,8 @@ class GymnasiumVectorEnv(VectorEnv):
         fresh = self._start(self._keys(seed))
         self.state = fresh if mask.all() else self._choose(mask, fresh, begun(self))
         self.steps, self.over = np.where(mask, 0, self.steps), self.over & ~mask
-        return to_numpy(self.state.observation), self._infos(np.zeros(self.num_envs, bool))
+        infos = to_numpy(self.state.metrics) | {"lost": np.zeros(self.num_envs, bool)}
+        return to_numpy(self.state.observation), infos
 
     def _keys(self, seed: Any = None) -> Array:
         """Returns a key [B] for each environment's start."""
@@ -167,11 +168,8 @@ class GymnasiumVectorEnv(VectorEnv):
         truncated = (np.array(stepped.truncated) | late) & ~terminated
         self.over = terminated | truncated
         reward = np.where(new, 0.0, np.asarray(stepped.reward))
-        infos = self._infos(np.asarray(lost) & ~new)
+        infos = to_numpy(stepped.metrics) | {"lost": np.asarray(lost) & ~new}
         return to_numpy(stepped.observation), reward, terminated, truncated, infos
-
-    def _infos(self, lost: np.ndarray) -> dict[str, Any]:
-        return to_numpy(self.state.metrics) | {"lost": lost}
 
 
 gymnasium_vector_env = GymnasiumVectorEnv

@@ -32,13 +32,11 @@ def check_env(env: Env, num_envs: int = 16, num_steps: int = 4) -> None:
       EnvError: names the field that broke a rule, and the rule.
     """
     check_shapes(env)
-    check_traces(env)
     trial = try_out(env, num_envs, num_steps)
-    check_keys_repeat(trial)
+    check_repeats(env, trial)
     check_differs(trial.start)
     check_finite("reset", trial.start)
     check_finite("step", trial.states)
-    check_steps_repeat(trial)
     ended = trial.last.replace(terminated=jnp.ones(num_envs, bool))
     check_finite("a step after termination", trial.rollout(ended, trial.actions)[1])
 
@@ -73,14 +71,11 @@ def try_out(env: Env, num_envs: int, num_steps: int) -> Trial:
     return Trial(start, restart, actions, last, states, rollout)
 
 
-def check_keys_repeat(trial: Trial) -> None:
-    """Checks that reset does the same twice."""
+def check_repeats(env: Env, trial: Trial) -> None:
+    """Checks that the environment does the same twice: in two programs, and in one."""
+    check_traces(env)
     rule = "reset must be a function of its key alone"
     _check_bits("equal keys", trial.start, trial.restart, rule)
-
-
-def check_steps_repeat(trial: Trial) -> None:
-    """Checks that step does the same twice."""
     again = trial.rollout(_again(trial.start), trial.actions)[1]
     rule = "step must be a function of both alone"
     _check_bits("equal states and actions", trial.states, again, rule)

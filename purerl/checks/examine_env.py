@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from purerl.checks import check_env, check_traces, examine_physics
+from purerl.checks import check_env, examine_physics
 from purerl.checks.findings import Finding, error, ok, some, warning
 from purerl.checks.user_code import in_words, own_line, program_errors
 from purerl.core.env import ABSURD, Env, EnvError, State
@@ -22,7 +22,8 @@ LARGE = 1e4  # std beyond which a unit is probably wrong
 
 def examine(env: Env, num_steps: int = NUM_STEPS) -> Iterator[Finding]:
     """Yields what is found of an environment, the cheapest first; stops where it cannot go on."""
-    before = _members(env)
+    held = getattr(env, "__dict__", {})
+    before = dict(held)
     reasons.said.clear()
     try:
         check_env.check_shapes(env)
@@ -30,7 +31,7 @@ def examine(env: Env, num_steps: int = NUM_STEPS) -> Iterator[Finding]:
         yield error("protocol", one_line(broken))
         return
     yield ok("protocol", "names, shapes and dtypes")
-    changed = sorted(n for n, x in _members(env).items() if before.get(n, env) is not x)
+    changed = sorted(n for n, x in held.items() if before.get(n, env) is not x)
     if changed:
         what = f"reset or step sets env.{changed[0]}, and a compiled program does so only once"
         yield error("own state", f"{what}: what an episode must remember goes into State.task.")
@@ -40,24 +41,11 @@ def examine(env: Env, num_steps: int = NUM_STEPS) -> Iterator[Finding]:
     except Exception as failed:
         yield error("steps", f"it cannot be stepped: {in_words(failed)}{own_line(failed)}")
         return
-    yield check_repeats(env, trial)
+    yield _told("same twice", "reset and step", error, check_env.check_repeats, env, trial)
     yield from check_trial(trial)
     if reason := reasons.most():
         yield warning("mujoco", reason)
-    yield from examine_physics.check_controls(env, trial)
-    yield from examine_physics.check_placed(env)
-    yield from examine_physics.check_model(env, trial)
-
-
-def check_repeats(env: Env, trial: check_env.Trial) -> Finding:
-    """Tells whether the environment does the same twice: in one program, and in two."""
-    checks = (
-        (check_traces.check_traces, env),
-        (check_env.check_keys_repeat, trial),
-        (check_env.check_steps_repeat, trial),
-    )
-    twice = [_told("same twice", "reset and step", error, *check) for check in checks]
-    return next((one for one in twice if one.level != "ok"), twice[0])
+    yield from examine_physics.examine(env, trial)
 
 
 def check_trial(trial: check_env.Trial) -> Iterator[Finding]:
@@ -85,16 +73,6 @@ def first_state(start: State) -> list[Finding]:
     found = [check_keys(start)] if size > 1 else []
     found += _ended(np.asarray(start.terminated))
     return [one for one in found if one.level != "ok"]
-
-
-def tell_first(start: State | None, say: Callable[[str], None]) -> None:
-    """Says what `first_state` finds; of a run that goes on (None) it has been said."""
-    for finding in first_state(start) if start is not None else []:
-        say(str(finding))
-
-
-def _members(env: Env) -> dict[str, Any]:
-    return dict(getattr(env, "__dict__", {}))
 
 
 def _told(about: str, good: str, bad: Callable, check: Callable, *arguments: Any) -> Finding:

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 
 from purerl.checks.findings import Finding, error, ok, some, warning
 from purerl.core.records import Array, Network, PyTree
@@ -51,10 +52,8 @@ def _moved(params: PyTree) -> PyTree:
     A layer that begins with zeros, as the last of a residual block often does, hides all before it
     until then.
     """
-    leaves, tree = jax.tree.flatten(params)
-    pairs = zip(jax.random.split(jax.random.key(0), len(leaves)), leaves, strict=True)
-    moved = [x + STEP * jax.random.normal(k, x.shape, x.dtype) for k, x in pairs]
-    return jax.tree.unflatten(tree, moved)
+    noise = optax.tree.random_like(jax.random.key(0), params)
+    return jax.tree.map(lambda x, step: x + STEP * step, params, noise)
 
 
 def _normalize(x: Array) -> Array:

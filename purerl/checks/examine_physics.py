@@ -2,6 +2,8 @@
 
 import contextlib
 import copy
+import functools
+import inspect
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -11,7 +13,7 @@ import numpy as np
 
 from purerl.checks.check_env import Trial
 from purerl.checks.findings import Finding, error, ok, warning
-from purerl.core.env import Env, State
+from purerl.core.env import State
 from purerl.core.records import Array
 
 TINY = 1e-5  # of a range: what rounding may do
@@ -22,73 +24,74 @@ LARGE = 4 * np.pi  # one that was written in degrees, and read as radians
 SLIDE, NEWTON = 2, 2  # of mujoco.mjtJoint and mjtSolver
 
 
-class Seen(NamedTuple):
-    """Calls of one trace, in order."""
+# A call of a physics: "init" or "step", arguments by name, the PhysicsState that it returned.
+Call = tuple[str, dict[str, Any], Any]
 
-    controls: list[Array]  # [nu] that `step` was given
-    states: list[Any]  # PhysicsState that `init` and `step` returned
-    calls: list[tuple]  # positional and named arguments
+
+def examine(env: Any, trial: Trial) -> Iterator[Finding]:
+    """Yields what is found of `env.physics`; nothing where that is no purerl.Physics."""
+    if hasattr(getattr(env, "physics", None), "substeps"):
+        yield from check_controls(env, trial)
+        yield from check_placed(env)
+        yield from check_ranges(env.physics.model)
+        yield from check_solver(env, trial)
 
 
 @contextlib.contextmanager
-def watching(physics: Any) -> Iterator[Seen]:
-    """Notes what `physics` is given and what it returns, as long as this lasts."""
-    seen = Seen([], [], [])
+def watching(physics: Any) -> Iterator[list[Call]]:
+    """Notes the calls of `physics`, in order, as long as this lasts."""
+    calls: list[Call] = []
 
-    def init(*arguments: Any, **named: Any) -> Any:
-        answer = type(physics).init(physics, *arguments, **named)
-        seen.states.append(answer[0])
-        seen.calls.append((arguments, named))
+    def noted(name: str, *arguments: Any, **named: Any) -> Any:
+        function = functools.partial(getattr(type(physics), name), physics)
+        answer = function(*arguments, **named)
+        given = inspect.signature(function).bind(*arguments, **named).arguments
+        calls.append((name, given, answer[0]))
         return answer
 
-    def step(state: Any, ctrl: Array, *arguments: Any, **named: Any) -> Any:
-        answer = type(physics).step(physics, state, ctrl, *arguments, **named)
-        seen.controls.append(jnp.asarray(ctrl))
-        seen.states.append(answer[0])
-        seen.calls.append(((state, ctrl, *arguments), named))
-        return answer
-
-    physics.init, physics.step = init, step
+    physics.init, physics.step = (functools.partial(noted, name) for name in ("init", "step"))
     try:
-        yield seen
+        yield calls
     finally:
         del physics.init, physics.step
 
 
-def check_controls(env: Env, trial: Trial) -> list[Finding]:
+def step_calls(env: Any, state: State, action: Array) -> list[Call]:
+    """Returns the calls of a control step."""
+    with watching(env.physics) as calls:
+        env.step(state, action)
+    return calls
+
+
+def check_controls(env: Any, trial: Trial) -> Iterator[Finding]:
     """Warns of controls that MuJoCo clamps: what lies beyond is an action without effect."""
-    physics: Any = getattr(env, "physics", None)
-    if not hasattr(physics, "model") or not physics.model.nu:
-        return []
+    from purerl.physics import lookup
+
+    model = env.physics.model
 
     def controls(state: State, action: Array) -> list[Array]:
-        with watching(physics) as seen:
-            env.step(state, action)
-        return seen.controls
+        calls = step_calls(env, state, action)
+        return [given["ctrl"] for name, given, _ in calls if name == "step"]
 
     try:
         # Only the controls are asked for, so that nothing is simulated.
         batch = jax.jit(jax.vmap(jax.vmap(controls, (0, 0)), (None, 0)))
         given = [np.asarray(x) for x in batch(trial.start, trial.actions)]
     except Exception:  # a trace of the user's own around the physics
-        return []
-    return [_describe_controls(physics.model, np.stack(given))] if given else []
-
-
-def _describe_controls(model: Any, given: np.ndarray) -> Finding:
-    """Compares controls [..., nu] with the range of each actuator."""
-    from purerl.physics import lookup
-
-    flat = given.reshape(-1, model.nu)
+        return
+    if not given or not model.nu:
+        return
+    flat = np.stack(given).reshape(-1, model.nu)
     least, most = flat.min(0), flat.max(0)
     low, high = model.actuator_ctrlrange.T
     slack = TINY * np.maximum(high - low, 1.0)
     over = model.actuator_ctrllimited.astype(bool) & ((least < low - slack) | (most > high + slack))
     names = lookup.names(model, "actuator")
     if not over.any():
-        return ok("controls", f"of {model.nu} actuators, none beyond its ctrlrange")
+        yield ok("controls", f"of {model.nu} actuators, none beyond its ctrlrange")
+        return
     i = int(np.argmax(over))
-    return warning(
+    yield warning(
         "controls",
         f"{over.sum()} of {model.nu} actuators are driven beyond their ctrlrange, where MuJoCo "
         f"clamps: {names[i] or i} gets {least[i]:.3g} to {most[i]:.3g}, and has {low[i]:.3g} to "
@@ -96,23 +99,20 @@ def _describe_controls(model: Any, given: np.ndarray) -> Finding:
     )
 
 
-def check_placed(env: Env, num_envs: int = 4) -> list[Finding]:
+def check_placed(env: Any, num_envs: int = 4) -> list[Finding]:
     """Finds what the physics is told wrongly or late, in an episode's reset and its first step.
 
     The first readings, and so the first observation, are of what `init` was given.
     """
-    physics: Any = getattr(env, "physics", None)
-    if not hasattr(physics, "model"):
-        return []
+    physics = env.physics
 
     def begin(key: Array) -> Begun:
-        with watching(physics) as seen:
+        with watching(physics) as calls:
             state = env.reset(key)
-            resets = len(seen.calls)
+            resets = len(calls)
             env.step(state, jnp.zeros(env.action_size))
-        given = _named(("qpos", "qvel", "changes", "ctrl", "act"), seen.calls[resets - 1])
-        later = _named(("state", "ctrl", "changes"), (seen.calls[resets:] or [((), {})])[0])
-        return Begun(given, later, seen.states[resets - 1], state.physics)
+        (_, given, before), *later = calls[resets - 1 : resets + 1]
+        return Begun(given, later[0][1] if later else {}, before, state.physics)
 
     try:
         begun = jax.jit(jax.vmap(begin))(jax.random.split(jax.random.key(0), num_envs))
@@ -131,10 +131,6 @@ class Begun(NamedTuple):
     later: dict[str, Any]  # arguments of the first step, by an action of zeros
     before: Any  # PhysicsState that init returned
     after: Any  # that of the state that reset returned
-
-
-def _named(names: tuple[str, ...], call: tuple) -> dict[str, Any]:
-    return {**dict(zip(names, call[0], strict=False)), **call[1]}
 
 
 def _find_zeros(physics: Any, begun: Begun) -> Iterator[Finding]:
@@ -218,14 +214,6 @@ def check_changes(physics: Any, begun: Begun) -> Iterator[Finding]:
                 yield warning("changes", f"{what}, {cure}")
 
 
-def check_model(env: Env, trial: Trial) -> Iterator[Finding]:
-    """Yields what is found of the model of `env.physics`; nothing where there is none."""
-    physics: Any = getattr(env, "physics", None)
-    if hasattr(physics, "substeps"):
-        yield from check_ranges(physics.model)
-        yield from check_solver(env, physics, trial)
-
-
 def check_ranges(model: Any) -> Iterator[Finding]:
     """Warns of joints' ranges of angles that look like degrees read as radians, or the reverse."""
     from purerl.physics import lookup
@@ -242,26 +230,22 @@ def check_ranges(model: Any) -> Iterator[Finding]:
             yield warning("ranges", f"{what}, and {odd.sum()} ranges look like that: {cure}.")
 
 
-def check_solver(env: Env, physics: Any, trial: Trial) -> Iterator[Finding]:
+def check_solver(env: Any, trial: Trial) -> Iterator[Finding]:
     """Compares control steps with those of a solver of many more iterations, both of MuJoCo's C."""
     from purerl.physics.interface import Physics
 
-    def given(state: State, action: Array) -> tuple[Any, Any]:
-        with watching(physics) as seen:
-            env.step(state, action)
-        return seen.calls[0]
-
     def after(model: Any) -> np.ndarray:
         step = Physics(model, (), physics.substeps, "c").step
-        batch = jax.vmap(jax.vmap(lambda call: step(*call[0], **call[1])[0].qpos))
+        batch = jax.vmap(jax.vmap(lambda given: step(**given)[0].qpos))
         return np.asarray(jax.jit(batch)(calls))
 
+    physics, first = env.physics, lambda state, action: step_calls(env, state, action)[0][1]
     solved, opt = copy.copy(physics.model), physics.model.opt
     solved.opt.solver, solved.opt.iterations, solved.opt.ls_iterations = NEWTON, 1000, 500
     try:
         states = jax.tree.map(lambda x, y: jnp.r_[x[None], y[:-1]], trial.start, trial.states)
-        calls = jax.jit(jax.vmap(jax.vmap(given)))(states, trial.actions)
-        old, own, best = np.asarray(calls[0][0].qpos), after(physics.model), after(solved)
+        calls = jax.jit(jax.vmap(jax.vmap(first)))(states, trial.actions)
+        old, own, best = np.asarray(calls["state"].qpos), after(physics.model), after(solved)
     except Exception:  # a trace of the user's own around the physics
         return
     good = np.isfinite(old + best).all(-1)

@@ -66,13 +66,6 @@ class Layout(NamedTuple):
         ]
 
 
-def make_layout(shards: Shards, num_envs: int) -> Layout:
-    """Lays shards out over the first D devices, in JAX's order."""
-    devices = np.array(jax.devices()[: shards.devices])
-    mesh = Mesh(devices, (AXIS,), axis_types=(AxisType.Auto,))
-    return Layout(shards, num_envs // shards.number, mesh)
-
-
 # --- arrays ---
 
 
@@ -179,8 +172,9 @@ def compile_update(
     shards: Shards, config: Config, env: Env, network: Network, abstract: TrainState
 ) -> Compiling:
     """Compiles an update of several shards, from the `abstract` shapes of the whole state."""
-    begin, layout = time.perf_counter(), make_layout(shards, config.num_envs)
-    mesh = layout.mesh
+    begin, devices = time.perf_counter(), np.array(jax.devices()[: shards.devices])
+    mesh = Mesh(devices, (AXIS,), axis_types=(AxisType.Auto,))
+    layout = Layout(shards, config.num_envs // shards.number, mesh)
     learned = abstract.replace(**dict.fromkeys(PLACES))
     collects, experience, sums = compile_collects(layout, config, env, network, abstract)
     improving = jax.jit(

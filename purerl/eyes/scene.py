@@ -10,7 +10,7 @@ from purerl.core.errors import unknown_name
 from purerl.core.records import Array
 from purerl.eyes.eye import rotation
 from purerl.eyes.shapes import FIELD, KINDS
-from purerl.physics import lookup
+from purerl.physics import drawing, lookup
 
 GREY = np.array([0.299, 0.587, 0.114])  # of red, green and blue
 
@@ -57,7 +57,7 @@ def shapes_of(model: mujoco.MjModel, hide: Sequence[str] = ()) -> Shapes:
         scale,
         model.geom_size[seen, 1] / scale[:, 0],
         np.where(radius > 0.0, radius, np.inf),  # a plane has none
-        np.array([_grey(model, int(i)) for i in seen]),
+        np.array([drawing.color_of(model, int(i))[:3] @ GREY for i in seen]),
         heights,
     )
     return Shapes(model.geom_bodyid[seen], kind, *(x.astype(np.float32) for x in numbers))
@@ -77,17 +77,3 @@ def _hidden(model: mujoco.MjModel, hide: Sequence[str]) -> np.ndarray:
         below[i] |= below[model.body_parentid[i]]
     named = below[model.geom_bodyid] | np.isin(geoms, list(hide))
     return named | (model.geom_group > 2) | (model.geom_rgba[:, 3] == 0.0)
-
-
-def _grey(model: mujoco.MjModel, geom: int) -> float:
-    """Returns a geom's own grey, 0 to 1: of its color, and of its texture on the whole."""
-    material = model.geom_matid[geom]
-    if material < 0:
-        return model.geom_rgba[geom, :3] @ GREY
-    color, texture = model.mat_rgba[material, :3], model.mat_texid[material].max()
-    if texture >= 0 and model.tex_nchannel[texture] >= 3:
-        channels, start = model.tex_nchannel[texture], model.tex_adr[texture]
-        number = model.tex_height[texture] * model.tex_width[texture] * channels
-        pixels = model.tex_data[start : start + number].reshape(-1, channels)
-        color = color * pixels[:, :3].mean(0) / 255.0
-    return color @ GREY

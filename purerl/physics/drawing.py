@@ -64,22 +64,18 @@ class Stage:
         """Lets the camera take its height and distance anew."""
         self.followed_height = None
 
-    def put(self, picture: Picture) -> None:
-        """Writes a picture, given as numpy arrays, into model and data; computes nothing."""
+    def pose(self, picture: Picture) -> None:
+        """Puts everything where it is in a picture of numpy arrays, and aims the camera.
+
+        The camera points at the followed body, or where the model has it.
+        """
         for name, values in picture.changes.items():
             getattr(self.model, name)[...] = values
         self.data.qpos[:] = picture.qpos
         self.data.mocap_pos[:] = picture.mocap_pos
         self.data.mocap_quat[:] = picture.mocap_quat
 
-    def pose(self, picture: Picture) -> None:
-        """Puts everything where it is in a picture, and aims the camera."""
-        self.put(picture)
         mujoco.mj_fwdPosition(self.model, self.data)
-        self._aim()
-
-    def _aim(self) -> None:
-        """Points the camera at the followed body, or leaves it to the model."""
         if self.fixed is not None:
             self.camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
             self.camera.fixedcamid = self.fixed
@@ -114,6 +110,20 @@ def add_scenery(scene: mujoco.MjvScene, scenery: tuple[Array, ...]) -> None:
         # MuJoCo leaves these as they were in memory, and draws nothing for some of their values.
         geom.category, geom.transparent = int(mujoco.mjtCatBit.mjCAT_DECOR), 0
         scene.ngeom += 1
+
+
+def color_of(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """Returns a geom's color [4]: its own, else its material's, and of a texture the mean."""
+    material, own = model.geom_matid[geom], model.geom_rgba[geom]
+    if material < 0 or not np.allclose(own, [0.5, 0.5, 0.5, 1.0]):
+        return own
+    color, texture = model.mat_rgba[material], model.mat_texid[material].max()
+    if texture < 0 or model.tex_nchannel[texture] < 3:
+        return color
+    start, depth = model.tex_adr[texture], model.tex_nchannel[texture]
+    size = model.tex_height[texture] * model.tex_width[texture] * depth
+    pixels = model.tex_data[start : start + size].reshape(-1, depth)
+    return np.append(color[:3] * pixels[:, :3].mean(0) / 255.0, color[3])
 
 
 def find_camera(model: mujoco.MjModel, camera: str) -> int:

@@ -9,7 +9,7 @@ import contextlib
 import copy
 import functools
 import threading
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,12 @@ from purerl.physics import host_calls, lookup, reasons
 _BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{x}")) for x in ("QPOS", "QVEL", "QACC", "CTRL")]
 # Contacts or constraints that MuJoCo left out, as the model's memory was full.
 _FULL = [int(getattr(mujoco.mjtWarning, f"mjWARN_{x}FULL")) for x in ("CONTACT", "CNSTR")]
+
+
+# Simulations, and their live arrays, [N, ...] each: state, ctrl and changed fields of the model,
+# which a row brings; state and readings, which a row takes away, in the order of packed rows; and
+# [N] 1 where contacts were left out, the reading "overflow".
+Rows = tuple[Batch, list[np.ndarray], list[np.ndarray], np.ndarray]
 
 
 class CEngine:
@@ -70,24 +76,15 @@ class CEngine:
         state = jax.tree.unflatten(structure, out[: len(leaves)])
         return state, self.record(*out[len(leaves) :])
 
-    def rows_of(self, number: int, fields: tuple[str, ...], names: tuple[str, ...]) -> "Rows":
+    def rows_of(self, number: int, fields: tuple[str, ...], names: tuple[str, ...]) -> Rows:
         """Returns the simulations of `number` environments, and where their packed rows go."""
         if (number, fields, names) not in self.rows:
             batch = Batch(_movable(self.model, names), number, nthread=host_calls.usable_cores())
             full, state = np.zeros(number, np.float32), [batch.bind(n) for n in fields]
             out = [full if n == "overflow" else batch.bind(n) for n in self.record._fields]
             targets = [*state, batch.bind("ctrl"), *(batch.expand(n) for n in names)]
-            self.rows[number, fields, names] = Rows(batch, targets, [*state, *out], full)
+            self.rows[number, fields, names] = batch, targets, [*state, *out], full
         return self.rows[number, fields, names]
-
-
-class Rows(NamedTuple):
-    """Simulations, and their live arrays in the order of packed rows, [N, ...] each."""
-
-    batch: Batch
-    targets: list[np.ndarray]  # state, ctrl and changed fields of the model: what a row brings
-    sources: list[np.ndarray]  # state and readings: what a row takes away
-    full: np.ndarray  # [N] 1 where contacts were left out: the reading "overflow"
 
 
 def _movable(model: mujoco.MjModel, names: tuple[str, ...]) -> mujoco.MjModel:

@@ -72,9 +72,7 @@ class JaxEngine:
         with mjx_defaults():
             return self._exact_step(state, ctrl, changes)
 
-    def plain_init(
-        self, state: PyTree, changes: dict[str, Array], ctrl: Array | None = None
-    ) -> tuple:
+    def plain_init(self, state: PyTree, changes: dict[str, Array], ctrl: Array | None) -> tuple:
         """Does what `init` does, with sums in any order."""
         data = self.data.replace(**vars(state), **({} if ctrl is None else {"ctrl": ctrl}))
         return self._read(_forward(self._changed(changes), data, bool(self.late)))

@@ -67,13 +67,13 @@ def center_name(number: int) -> str:
     return "IQM" if number >= LEAST_IQM else "mean"
 
 
-def resample(strata: Sequence[Values], seed: int, number: int = RESAMPLES) -> list[Values]:
+def resample(strata: Sequence[Values], seed: int, number: int) -> list[Values]:
     """Draws whole runs with replacement, R times within each stratum: each [n_k] -> [R, n_k]."""
     generator = np.random.default_rng(seed)
     return [s[generator.integers(0, len(s), (number, len(s)))] for s in strata]
 
 
-def draw(sizes: Sequence[int], seed: int, number: int = RESAMPLES) -> tuple[list[Values], Values]:
+def draw(sizes: Sequence[int], number: int = RESAMPLES) -> tuple[list[Values], Values]:
     """Draws the places of runs with replacement, within strata of n_k runs.
 
     Returns:
@@ -81,7 +81,7 @@ def draw(sizes: Sequence[int], seed: int, number: int = RESAMPLES) -> tuple[list
       most EXACT different ones, as often as it is among all that can be drawn.
     """
     if math.prod(math.comb(2 * n - 1, n) for n in sizes) > EXACT:
-        return resample([np.arange(n) for n in sizes], seed, number), np.ones(number)
+        return resample([np.arange(n) for n in sizes], 0, number), np.ones(number)
     rows = [np.array([*combinations_with_replacement(range(n), n)]) for n in sizes]
     orders = [[_orders(np.bincount(row)) for row in every] for every in rows]
     grid = [x.ravel() for x in np.indices([len(every) for every in rows])]
@@ -94,34 +94,32 @@ def _orders(repeats: Values) -> float:
     return math.factorial(int(repeats.sum())) / math.prod(map(math.factorial, repeats.tolist()))
 
 
-def mean_interval(values: Values, seed: int = 0) -> Interval | None:
+def mean_interval(values: Values) -> Interval | None:
     """Returns the bootstrap interval of the mean of values [n]; None for too few."""
-    return _interval(lambda strata: strata[0].mean(axis=-1), [[values]], seed)
+    return _interval(lambda strata: strata[0].mean(axis=-1), [values])
 
 
-def iqm_interval(strata: Sequence[Values], seed: int = 0) -> Interval | None:
+def iqm_interval(strata: Sequence[Values]) -> Interval | None:
     """Returns the stratified bootstrap interval of the IQM; None for too few runs."""
-    return _interval(pooled_iqm, [strata], seed)
+    return _interval(pooled_iqm, strata)
 
 
 def difference_interval(xs: Sequence[Values], ys: Sequence[Values]) -> Interval | None:
     """Returns the interval of IQM(x) - IQM(y), both resampled; None for too few runs."""
-    return _interval(lambda x, y: pooled_iqm(x) - pooled_iqm(y), [xs, ys])
+    return _interval(lambda x, y: pooled_iqm(x) - pooled_iqm(y), xs, ys)
 
 
 def improvement_interval(xs: Sequence[Values], ys: Sequence[Values]) -> Interval | None:
     """Returns the interval of the probability of improvement; None for too few runs."""
-    return _interval(stratified_probability, [xs, ys])
+    return _interval(stratified_probability, xs, ys)
 
 
-def _interval(
-    statistic: Callable[..., Values], groups: Sequence[Sequence[Values]], seed: int = 0
-) -> Interval | None:
+def _interval(statistic: Callable[..., Values], *groups: Sequence[Values]) -> Interval | None:
     """Returns the interval of a statistic of groups, each resampled; None for too few runs."""
     if not all(map(_enough, groups)):
         return None
     strata = [stratum for group in groups for stratum in group]
-    rows, counts = draw([len(stratum) for stratum in strata], seed)
+    rows, counts = draw([len(stratum) for stratum in strata])
     drawn = iter([stratum[i] for stratum, i in zip(strata, rows, strict=True)])
     return _percentiles(statistic(*([next(drawn) for _ in group] for group in groups)), counts)
 
@@ -161,7 +159,7 @@ def curve_band(strata: Sequence[Values], number: int = 2000) -> Band:
     iqm = pooled_iqm([s.T for s in strata])
     if not _enough(strata):
         return Band(iqm, None, None)
-    rows, counts = draw([len(s) for s in strata], 0, number)
+    rows, counts = draw([len(s) for s in strata], number)
     ends = [
         _percentiles(pooled_iqm([s[i, p] for s, i in zip(strata, rows, strict=True)]), counts)
         for p in range(len(iqm))

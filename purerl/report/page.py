@@ -38,13 +38,15 @@ def make_page(runs: Sequence[run_reader.RunRecord], group_by: Sequence[str] = ()
     sections = page_series.panels(groups)
     experiments = list(dict.fromkeys(run.settings["experiment"] for run in runs))
     title = f"{', '.join(experiments)}: {len(runs)} run{'s' * (len(runs) > 1)}"
+    more = len(page_series.metric_names(runs)) - page_series.MOST_PANELS
+    said = f"{more:,} more metrics have no chart: a page takes {page_series.MOST_PANELS}."
     body = [
         element("h1", title),
         *_section("Runs", page_tables.runs_table(runs)),
         *_section("Scores", *page_tables.scores(result)),
         _controls(groups),
         *_charts(sections, len(groups) > 1),
-        *_unseen(runs),
+        *([element("p", said, class_="note")] if more > 0 else []),
         *_section("Last evaluation of each run", page_tables.evaluations(runs)),
         *_section("Settings", *page_tables.settings(runs, result)),
         *_section("Videos", *_media(folders)),
@@ -72,13 +74,10 @@ def _document(title: str, body: Sequence[Html], data: Html) -> str:
         element("title", title),
         element("style", style),
     )
-    inside = element("body", *map(_sendable, (*body, data)), element("script", script))
+    # Without the folders of absolute paths, which are nobody else's business.
+    sent = [Html(FOLDERS.sub(lambda found: found[1] or "", part)) for part in (*body, data)]
+    inside = element("body", *sent, element("script", script))
     return f"<!DOCTYPE html>\n{element('html', head, inside, lang='en')}\n"
-
-
-def _sendable(part: Html) -> Html:
-    """Returns a part without the folders of absolute paths, which are nobody else's business."""
-    return Html(FOLDERS.sub(lambda found: found[1] or "", part))
 
 
 def _digest(content: str) -> str:
@@ -137,13 +136,6 @@ def _charts(sections: Sequence[tuple[str, list[page_series.Panel]]], several: bo
     return parts
 
 
-def _unseen(runs: Sequence[run_reader.RunRecord]) -> list[Html]:
-    """Returns a line about metrics that have no chart; empty where all have."""
-    more = len(page_series.metric_names(runs)) - page_series.MOST_PANELS
-    said = f"{more:,} more metrics have no chart: a page takes {page_series.MOST_PANELS}."
-    return [element("p", said, class_="note")] if more > 0 else []
-
-
 BANDS = (
     "Bands: around the evaluation of one run, one standard deviation over its episodes; around a "
     "heavy line (the interquartile mean of a group, below four seeds the mean), the 95% interval "
@@ -183,7 +175,6 @@ def _series_data(
 def _media(folders: Sequence[Path]) -> list[Html]:
     room, parts = page_media.LARGEST_PAGE, list[Html]()
     for folder in folders:
-        media = page_media.read_media(folder, room)
-        room = media.room
-        parts += page_media.media_elements(folder.name, media)
+        more, room = page_media.media_elements(folder, room)
+        parts += more
     return [element("div", join(parts), class_="pictures")] if parts else []

@@ -6,7 +6,6 @@ stranger's folder does not put a file of the reader into it.
 
 import base64
 from pathlib import Path
-from typing import NamedTuple
 
 from purerl.core.errors import UserError
 from purerl.machine.files import check_inside, read_bytes
@@ -18,33 +17,32 @@ LARGEST_PAGE = 64 << 20  # [bytes] of all files of a page
 KINDS = {".mp4": ("video/mp4", 4, b"ftyp"), ".png": ("image/png", 0, b"\x89PNG\r\n\x1a\n")}
 
 
-class Media(NamedTuple):
-    """A run's pictures, or why there are none."""
-
-    files: dict[str, dict[str, bytes]]  # name without suffix -> suffix -> content
-    left_out: list[str]  # a line for each
-    room: int  # bytes that the page still takes
-
-
-def read_media(folder: Path, room: int) -> Media:
-    """Reads a run's videos and sheets, newest first.
+def media_elements(folder: Path, room: int) -> tuple[list[Html], int]:
+    """Returns a run's videos, newest first, each over its sheet; what was left out; the room left.
 
     Args:
       folder: the run's.
       room: how many bytes the page still takes.
     """
-    found = Media({}, [], room)
+    files: dict[str, dict[str, bytes]] = {}  # name without suffix -> suffix -> content
+    parts, left_out = list[Html](), list[Html]()
     names = (folder / "videos").glob("[!.]*.*")
     for path in sorted(names, key=lambda path: (path.stem, path.suffix), reverse=True):
         if path.suffix in KINDS:
             try:
                 content = _read(folder, path, min(room, LARGEST))
             except UserError as error:
-                found.left_out.append(str(error).replace(f"{folder}/", ""))
+                line = str(error).replace(f"{folder}/", "")
+                left_out.append(element("p", f"Left out: {line}", class_="note"))
                 continue
             room -= len(content)
-            found.files.setdefault(path.stem, {})[path.suffix] = content
-    return found._replace(room=room)
+            files.setdefault(path.stem, {})[path.suffix] = content
+    for name, kinds in files.items():
+        about = f"{folder.name}, {name}"
+        inside = [_element(suffix, kinds[suffix], about) for suffix in sorted(kinds)]
+        caption = element("figcaption", f"{folder.name}: {name}")
+        parts.append(element("figure", caption, *inside, class_="media"))
+    return parts + left_out, room
 
 
 def _read(folder: Path, path: Path, largest: int) -> bytes:
@@ -55,16 +53,6 @@ def _read(folder: Path, path: Path, largest: int) -> bytes:
     if content[start : start + len(signature)] != signature:
         raise UserError(f"{path} is no {kind}: its first bytes are others.")
     return content
-
-
-def media_elements(title: str, media: Media) -> list[Html]:
-    """Returns a run's videos, each over its sheet, and what was left out."""
-    parts = []
-    for name, files in media.files.items():
-        inside = [_element(suffix, files[suffix], f"{title}, {name}") for suffix in sorted(files)]
-        caption = element("figcaption", f"{title}: {name}")
-        parts.append(element("figure", caption, *inside, class_="media"))
-    return parts + [element("p", f"Left out: {line}", class_="note") for line in media.left_out]
 
 
 def _element(suffix: str, content: bytes, about: str) -> Html:

@@ -15,7 +15,6 @@ from purerl.machine.files import write_answer
 from purerl.report import flat_program, onnx_nodes, policy_file
 from purerl.runs.loaded_run import Run
 
-KINDS = {"tensor(uint8)": np.uint8}  # of inputs other than float32
 IR_VERSION = 8  # the file format that goes with the operator set
 
 
@@ -87,8 +86,7 @@ def caller(file: Path) -> Callable[[PyTree, PyTree], tuple[np.ndarray, PyTree]]:
     def call(observation: PyTree, memory: PyTree) -> tuple[np.ndarray, PyTree]:
         leaves, tree = jax.tree.flatten(memory)
         values = [*jax.tree.leaves(observation), *leaves]
-        pairs = zip(given, values, strict=True)
-        arrays = {e.name: np.asarray(x, KINDS.get(e.type, np.float32)) for e, x in pairs}
+        arrays = {e.name: np.asarray(x) for e, x in zip(given, values, strict=True)}
         action, *following = session.run(taken, arrays)
         return action, jax.tree.unflatten(tree, following)
 

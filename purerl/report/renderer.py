@@ -10,7 +10,7 @@ import numpy as np
 from purerl.core.errors import UserError
 
 # The last one is for rooms that may not import physics.
-from purerl.physics.drawing import Picture, Stage, add_scenery, root_body  # noqa: F401
+from purerl.physics.drawing import Picture, Stage, add_scenery, color_of, root_body  # noqa: F401
 from purerl.report.opengl import open_gl
 
 

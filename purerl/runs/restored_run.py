@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 from purerl.checks import findings, held_arrays, user_code
 from purerl.core.errors import RunError, UserError, one_line
-from purerl.core.records import TrainState
 from purerl.devices import memory, programs
 from purerl.experiment import definition, loading, settings_json, source_hashes
 from purerl.experiment.objects import Setup, build, physics_hash
@@ -14,7 +13,7 @@ from purerl.experiment.trust import load_copy
 from purerl.machine.output import Say
 from purerl.runs import checkpoint, checkpoint_folder, manifest
 from purerl.runs.folder import CODE, CONFIG, Folder, check_manifest, read_run
-from purerl.runs.resume import edited
+from purerl.runs.resume import EDITED
 
 
 class RestoredRun(NamedTuple):
@@ -58,8 +57,8 @@ def restore(
         raise UserError(f"{folder} cannot be built with its {CONFIG}: {what}") from error
     for what in _changed_since(begun, source, setup):
         say(f"{folder}: {what} is not that of the run any more.")
-    for what in edited(run):
-        say(f"Edited since the run: {what}.")
+    if run.is_edited:
+        say(f"Edited since the run: {EDITED}.")
     return RestoredRun(chosen, setup, read_checkpoint(run, update, setup, say), source, run)
 
 
@@ -76,7 +75,17 @@ def read_checkpoint(run: Folder, update: str, setup: Setup, say: Say) -> checkpo
             f"The state of {run.path} takes {size / 1e9:,.0f} GB, by its config.json; this machine "
             f"has {room / 1e9:,.0f} GB of memory."
         )
-    return _choose(run, update, abstract, say)
+    folder, owners = run.checkpoints, manifest.owners(check_manifest(run))
+    if update == "latest":
+        whole = checkpoint.newest([folder], abstract, say, rename=False, owners=[owners])
+        if not whole:
+            raise UserError(f"{run.path} has no whole checkpoint yet.")
+        return whole[0]
+    path = find_checkpoint(run, update)
+    try:
+        return checkpoint.load_checkpoint(path, abstract, owners)
+    except checkpoint_folder.DamagedError as error:
+        raise UserError(f"The checkpoint {path} is damaged: {error}.") from error
 
 
 def _changed_since(begun: dict[str, Any], source: loading.Source, setup: Setup) -> list[str]:
@@ -102,21 +111,6 @@ def fill(old: Any, new: Any, say: Say, path: str = "") -> Any:
     for name in new.keys() - old.keys():
         say(f"{CONFIG} lacks {path}{name}; it is taken as {new[name]}.")
     return new | {name: fill(old[name], new.get(name), say, f"{path}{name}.") for name in old}
-
-
-def _choose(run: Folder, update: str, abstract: TrainState, say: Say) -> checkpoint.Saved:
-    """Reads the checkpoint that was asked for; see `restore`."""
-    folder, owners = run.checkpoints, manifest.owners(check_manifest(run))
-    if update == "latest":
-        whole = checkpoint.newest([folder], abstract, say, rename=False, owners=[owners])
-        if not whole:
-            raise UserError(f"{run.path} has no whole checkpoint yet.")
-        return whole[0]
-    path = find_checkpoint(run, update)
-    try:
-        return checkpoint.load_checkpoint(path, abstract, owners)
-    except checkpoint_folder.DamagedError as error:
-        raise UserError(f"The checkpoint {path} is damaged: {error}.") from error
 
 
 def find_checkpoint(run: Folder, update: str) -> Path:

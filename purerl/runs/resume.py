@@ -126,12 +126,7 @@ def changes(folder: Folder, now: Description) -> list[str]:
     found += manifest.differences(check_manifest(folder), now.manifest)
     if source_hashes.hash_code(folder.code) != source_hashes.hash_code(now.source.text):
         found.append(f"{CODE}: {now.source.path} has been edited")
-    return found + edited(folder)
-
-
-def edited(folder: Folder) -> list[str]:
-    """Returns a line if the three files that describe a run are not what it wrote."""
-    return [EDITED] if folder.is_edited else []
+    return found + [EDITED] * folder.is_edited
 
 
 def _check_trains_what_is_new(folder: Folder, config: dict[str, Any], found: list[str]) -> None:

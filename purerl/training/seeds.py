@@ -37,7 +37,8 @@ from purerl.training import console, loggers, loop
 from purerl.training.plan import Plan
 from purerl.training.writer import RunWriter
 
-NO_CHECKPOINT = {"update": 0, "metrics_bytes": 0, "metrics_sha256": hashlib.sha256().hexdigest()}
+NO_CHECKPOINT: dict[str, Any] = {"wall_s": 0.0, "update": 0, "metrics_bytes": 0}
+NO_CHECKPOINT |= {"metrics_sha256": hashlib.sha256().hexdigest()}
 
 
 class Job(NamedTuple):
@@ -108,8 +109,10 @@ def _train_together(job: Job, seeds: list[Seed], programs: Callable[[], Programs
             progress = stack.enter_context(console.progress(job.plan.updates))
         say = progress.say
         saved = kept_by_first(files.disk_errors()(lambda: _newest(job, seeds, say))) or []
-        known = in_first_process(lambda: _known(saved))
-        if known["update"] >= job.plan.updates:
+        last = saved[0].meta if saved else NO_CHECKPOINT
+        about = {name: last[name] for name in ("wall_s", "update")}
+        found, meta = in_first_process(lambda: (bool(saved), about))
+        if meta["update"] >= job.plan.updates:
             for one in saved:
                 say(f"Already done: {job.plan.updates} updates. Digest {one.meta['digest']}")
             return
@@ -118,8 +121,9 @@ def _train_together(job: Job, seeds: list[Seed], programs: Callable[[], Programs
         say(f"Compiled: {times}")
         for one in saved:
             say(f"Resuming after update {one.meta['update']}. Digest {one.meta['digest']}")
-        state = _first_state(known["found"], saved, seeds, job, compiled)
-        examine_env.tell_first(None if known["found"] else state.env_state, say)
+        state = _first_state(found, saved, seeds, job, compiled)
+        for finding in examine_env.first_state(state.env_state) if not found else ():
+            say(str(finding))
         writers: list[Any] = [processes.Silent(seed.path / CHECKPOINTS) for seed in seeds]
         if processes.is_first():
             with files.disk_errors():
@@ -129,7 +133,6 @@ def _train_together(job: Job, seeds: list[Seed], programs: Callable[[], Programs
             for writer in writers:
                 stack.callback(writer.close)
                 writer.loggers = loggers.open_loggers(job.options, writer.folder, say)
-        meta = {name: known[name] for name in ("wall_s", "update")}
         best = in_first_process(lambda: [writer.best() for writer in writers])
         stop = processes.agreed(job.stop)
         with user_code.program_errors():
@@ -156,12 +159,6 @@ def _newest(job: Job, seeds: list[Seed], say: output.Say) -> list[checkpoint.Sav
         if job.options.resume is True:
             say(f"There is no checkpoint in {places[0]}: it begins anew.")
     return saved
-
-
-def _known(saved: list[checkpoint.Saved]) -> dict[str, Any]:
-    """Returns where a run goes on, as every checkpoint says it."""
-    known = saved[0].meta if saved else {"wall_s": 0.0, "update": 0}
-    return {name: known[name] for name in ("wall_s", "update")} | {"found": bool(saved)}
 
 
 def _first_state(

@@ -8,8 +8,6 @@ from typing import Any
 from purerl.experiment.definition import Experiment
 from purerl.experiment.settings_json import settings_of
 
-ENV = "env"
-
 
 def option_words(name: str, default: Any, value: Any) -> list[str]:
     """Returns the words that turn a setting's default into `value`; [] where they are equal.
@@ -41,11 +39,6 @@ def _text(value: Any) -> str:
     return repr(float(short)) if abs(float(short) - value) <= 1e-9 * abs(value) else repr(value)
 
 
-def environment_words(written: Experiment, env: Any) -> list[str]:
-    """Returns the words that make these options of the environment of an experiment's file."""
-    return option_words(ENV, written.env, env)
-
-
 def train_command(name: str, written: Experiment, chosen: Experiment, env: Any) -> str:
     """Returns the command that trains these options of the environment.
 
@@ -56,6 +49,6 @@ def train_command(name: str, written: Experiment, chosen: Experiment, env: Any) 
       env: the environment's options.
     """
     parts = {n: v for n, v in settings_of(chosen).items() if dataclasses.is_dataclass(v)}
-    parts[ENV] = env
+    parts["env"] = env
     words = [w for n, v in parts.items() for w in option_words(n, getattr(written, n), v)]
     return shlex.join(["python", "-m", "purerl.run", name, *words])

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from purerl.checks import check_env, examine_env, examine_network
-from purerl.checks.examine_physics import check_controls, check_model, check_placed, check_ranges
+from purerl.checks.examine_physics import check_controls, check_placed, check_ranges, check_solver
 from purerl.core.env import State
 from purerl.core.records import Network, Normal, PolicyOutput
 from purerl.devices import memory
@@ -368,7 +368,7 @@ def balls(angle="radian", range="-1 1", iterations=100, solver="CG", **how):  # 
 )
 def test_a_solver_that_does_not_converge(solver, iterations, found):
     env = balls(iterations=iterations, solver=solver)
-    said = list(check_model(env, check_env.try_out(env, 4, 5)))
+    said = list(check_solver(env, check_env.try_out(env, 4, 5)))
     assert [one.about for one in said] == ["solver"]
     assert (said[0].level == "warning") == found
     assert f"by {iterations} iterations (50 of line search)" in said[0].text

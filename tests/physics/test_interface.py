@@ -109,7 +109,7 @@ def test_c_has_a_thread_for_each_core_that_it_may_use_and_the_same_bits(monkeypa
     monkeypatch.setattr("os.sched_getaffinity", lambda _: cores)
     p = Physics(copy.copy(biped()), READINGS, substeps=3, engine="c")
     state, _ = jax.vmap(p.init)(*starts(NUMBER, biped()))
-    assert p._engine.rows_of(NUMBER, (), ()).batch.nthread == len(cores)
+    assert p._engine.rows_of(NUMBER, (), ())[0].nthread == len(cores)
     for control, *expected in zip(controls, *jax.tree.leaves(states), strict=True):
         state, _ = jax.vmap(p.step)(state, control)
         jax.tree.map(np.testing.assert_array_equal, jax.tree.leaves(state), expected)

@@ -57,7 +57,8 @@ def play(problem: Any, options: Any, judges: dict[str, Any], stop: Callable[[], 
     begin = spoke = time.perf_counter()
     with users_errors(""), naming_broken_rules(env):
         for now, computed in episodes.episodes(*game, judges, keep):
-            wait(computed)
+            while not all(x.is_ready() for x in jax.tree.leaves(computed)):
+                time.sleep(WAIT)  # in Python, where a signal is heard: inside JAX none is
             rows.append(jax.device_get(computed))
             clock = time.perf_counter()
             if len(rows) == 1:
@@ -91,15 +92,6 @@ def film(path: Path, env: Env, end: episodes.Playing, rows: Sequence[dict[str, A
     recording = jax.device_get(episode_pictures.recording_of(env, pictures, running, end.progress))
     with video.renderer_of(env, FRAME) as renderer:
         video.draw(path, renderer, recording, env.control_timestep)
-
-
-def wait(arrays: Any) -> None:
-    """Waits for arrays that are being computed; a signal is heard meanwhile.
-
-    While Python waits inside JAX, no signal's handler runs, and a second signal could end nothing.
-    """
-    while not all(x.is_ready() for x in jax.tree.leaves(arrays)):
-        time.sleep(WAIT)
 
 
 def progress(title: str, playing: Any, limit: int, seconds: float, calls: int) -> str:

@@ -106,7 +106,7 @@ def _problem(found: Subject, chosen: definition.Experiment, options: PlanCommand
     return Problem(
         name=found.name,
         title=options.planner if run is None else f"{options.planner} + policy",
-        words=" ".join(overrides.environment_words(written.experiment, chosen.env)),
+        words=" ".join(overrides.option_words("env", written.experiment.env, chosen.env)),
         settings=settings_json.to_json(chosen)["env"],
         setup=objects.build(chosen),
         learned=None if run is None else run.state,

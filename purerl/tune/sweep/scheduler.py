@@ -48,11 +48,6 @@ class Ended(NamedTuple):
     said: str = ""  # the last line of one that failed
 
 
-class _Active(NamedTuple):
-    job: Job
-    process: subprocess.Popen | None  # None: another process still trains it
-
-
 # --- what folders tell ---
 
 
@@ -209,7 +204,7 @@ def carry_out(
       began: told of a job whose process has started.
       ended: told how each job ended.
     """
-    active: dict[int, _Active] = {}
+    active: dict[int, tuple[Job, subprocess.Popen | None]] = {}  # None: another still trains it
     received: list[int] = []
     todo = iter(jobs)
 
@@ -218,18 +213,18 @@ def carry_out(
             name = signal.Signals(number).name
             warn(f"\n{name}: {len(active)} runs save and stop. Once more to stop them at once.")
         received.append(number)
-        for one in active.values():
-            _send(one.process, number)
+        for _, process in active.values():
+            _send(process, number)
 
     def begin(slot: int, job: Job) -> None:
         if is_locked(job):  # by a process that outlived its scheduler
-            active[slot] = _Active(job, None)
+            active[slot] = job, None
         elif is_done(job):
             active.pop(slot, None)
             ended(Ended(job, "done"))
         else:
             process = start(job, environment_of(slot, at_once, gpus))
-            active[slot] = _Active(job, process)
+            active[slot] = job, process
             if received:  # the signal came while it was started
                 _send(process, received[0])
             began(job)
@@ -238,12 +233,12 @@ def carry_out(
         try:
             more = True
             while active or (more and not received):
-                for slot, one in list(active.items()):
-                    if one.process is None and not received:
-                        begin(slot, one.job)
-                    elif one.process is None or one.process.poll() is not None:
+                for slot, (one, process) in list(active.items()):
+                    if process is None and not received:
+                        begin(slot, one)
+                    elif process is None or process.poll() is not None:
                         del active[slot]
-                        ended(_ended(one, bool(received)))
+                        ended(_ended(one, process, bool(received)))
                 while more and not received and len(active) < at_once:
                     job = next(todo, None)
                     more = job is not None
@@ -251,20 +246,20 @@ def carry_out(
                         begin(min(set(range(at_once)) - set(active)), job)
                 time.sleep(POLL if active else 0.0)
         finally:  # an error of ours: nothing is left behind
-            for one in active.values():
-                _send(one.process, signal.SIGTERM)
-            for one in active.values():
-                if one.process is not None:
-                    end(one.job, one.process.wait())
+            for _, process in active.values():
+                _send(process, signal.SIGTERM)
+            for one, process in active.values():
+                if process is not None:
+                    end(one, process.wait())
     return bool(received)
 
 
-def _ended(one: _Active, asked: bool) -> Ended:
-    if one.process is None:
-        return Ended(one.job, "stopped")
-    found = end(one.job, one.process.returncode)
+def _ended(job: Job, process: subprocess.Popen | None, asked: bool) -> Ended:
+    if process is None:
+        return Ended(job, "stopped")
+    found = end(job, process.returncode)
     # One that was stopped while starting ends as the signal ends a program.
-    return Ended(one.job, "stopped") if asked and found.status == "failed" else found
+    return Ended(job, "stopped") if asked and found.status == "failed" else found
 
 
 def _send(process: subprocess.Popen | None, number: int) -> None:

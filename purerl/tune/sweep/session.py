@@ -1,7 +1,6 @@
 """Carries a sweep out: its folder, its runs, its table."""
 
 import contextlib
-import functools
 import hashlib
 import itertools
 import shlex
@@ -140,8 +139,10 @@ def _describe(sweep: Sweep) -> dict[str, Any]:
     options, base = sweep.options, sweep.base
     swept = {}
     for space in sweep.spaces:
-        read = functools.partial(points.read_value, base, space.setting)
-        swept[space.setting] = spaces.as_json(space, lambda text, read=read: to_json(read(text)))
+        # Choices as they are read: `1e-4` is `0.0001`.
+        values = [to_json(points.read_value(base, space.setting, text)) for text in space.choices]
+        ends = {"low": space.low, "high": space.high, "log": space.log}
+        swept[space.setting] = values or ends
     how = "random" if options.random else "optuna" if options.optuna else "grid"
     found = {"experiment": base.source.name, "settings": to_json(base.chosen), "swept": swept}
     found |= {"points": how, "seeds": options.seeds}

@@ -9,7 +9,7 @@ log:1e-5:1e-2   the same, the logarithm drawn evenly
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -143,10 +143,3 @@ def _draw_one(space: Space, generator: np.random.Generator) -> str:
     else:
         value = generator.uniform(low, high)
     return space.text(min(max(value, space.low), space.high))
-
-
-def as_json(space: Space, kind: Any) -> Any:
-    """Returns a space as JSON values: by `kind`, which reads a value, `1e-4` is `0.0001`."""
-    if space.choices:
-        return [kind(text) for text in space.choices]
-    return {"low": space.low, "high": space.high, "log": space.log}

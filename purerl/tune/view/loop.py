@@ -88,10 +88,6 @@ class Pace:
         """Begins to count."""
         self.since, self.frames, self.steps, self.said = time.perf_counter(), 0, 0, ""
 
-    def count(self, frames: int, steps: int) -> None:
-        """Counts frames drawn and control steps taken."""
-        self.frames, self.steps = self.frames + frames, self.steps + steps
-
     def words(self, timestep: float) -> str:
         """Returns how fast it goes, over the last second; `timestep` of control [s]."""
         seconds = time.perf_counter() - self.since
@@ -111,8 +107,7 @@ def play(
     Nothing moves while no browser shows the page. `say` is told when one comes or leaves.
     """
     beside, pace = Beside(), Pace()
-    page.build(session, source.checkpoints())
-    page.on_train(lambda: source.command(page.numbers))
+    page.build(session, source.checkpoints(), lambda: source.command(page.numbers))
     page.scene.show(session)
     last = said = looked = time.perf_counter()
     watched = False
@@ -131,7 +126,8 @@ def play(
             page.scene.show(session)
         elif session.picture is not before.picture:
             page.scene.draw(session)
-            pace.count(1, max(1, session.length - before.length))
+            pace.frames += 1
+            pace.steps += max(1, session.length - before.length)
         if now - said > SAY:
             said, timestep = now, session.program.env.control_timestep
             doing = beside.words or pace.words(timestep)

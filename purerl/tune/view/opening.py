@@ -116,7 +116,7 @@ def _source(
         except Exception as error:  # a rule of the options, until the sliders are taken back
             return one_line(error)
 
-    words = lambda env: shlex.join(overrides.environment_words(written, env))  # noqa: E731
+    words = lambda env: shlex.join(overrides.option_words("env", written.env, env))  # noqa: E731
     command = functools.partial(overrides.train_command, name, written, chosen)
     both = (functools.partial(told, words=one) for one in (words, command))
     return Source(program, _no_brain, tuple, *both)

@@ -24,11 +24,6 @@ MOVES = {"Step": events.step, "Next episode": events.next_episode}
 WAYS = {"forward": (1, 0, 0), "back": (-1, 0, 0), "left": (0, 1, 0), "right": (0, -1, 0),
         "up": (0, 0, 1)}  # fmt: skip
 COLORS = ("#222222", "#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b")
-PLOTS = {
-    "Reward per step": readouts.reward_plot,
-    "Value": readouts.value_plot,
-    "Actions": readouts.action_plot,
-}
 AS_IN_FILE = "# as in the experiment's file"  # as high as the overrides of one slider
 PLOT_HEIGHT, PANEL_WIDTH, EYES_WIDTH = 190, 380, 320  # [pixels]
 MOST_EVENTS = 1000  # that wait to be played
@@ -41,7 +36,7 @@ class Page:
         """Opens the page's server; port 0 is any free one."""
         self.events: queue.SimpleQueue[Any] = queue.SimpleQueue()
         key = secrets.token_urlsafe(16)
-        opened = gate.closed(key, self._find, lambda why: self.put(events.refuse, why))
+        opened = gate.closed(key, self._find, lambda why: self.put(events.change, "trouble", why))
         with contextlib.redirect_stdout(io.StringIO()), opened:  # viser prints a banner
             self.server = viser.ViserServer(host, port, label=title, verbose=False)
         self.port = self.server.get_port()
@@ -51,7 +46,6 @@ class Page:
         self.sliders: dict[Place, Any] = {}
         self.numbers: dict[Place, Any] = {}  # as the sliders have told them
         self.plots: dict[str, Any] = {}
-        self.names: dict[str, tuple[str, ...]] = {}  # of each plot's lines
         self.checkpoints: Any = None
         self.eyes: Any = None
 
@@ -76,7 +70,7 @@ class Page:
         """Returns the events since the last call."""
         return [self.events.get() for _ in range(self.events.qsize())]
 
-    def build(self, session: Session, checkpoints: Sequence[str]) -> None:
+    def build(self, session: Session, checkpoints: Sequence[str], train: Callable[[], str]) -> None:
         """Adds everything that a person moves and reads.
 
         Args:
@@ -90,18 +84,20 @@ class Page:
         moves.on_click(lambda _: put(MOVES[moves.value]))
         hint = "Simulated seconds in a real one"
         speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1", hint=hint)
-        speed.on_update(lambda _: put(events.speed, float(speed.value)))
+        speed.on_update(lambda _: put(events.change, "speed", float(speed.value)))
         follow = gui.add_checkbox("Camera follows", True)
         follow.on_update(lambda _: setattr(self.scene, "follows", follow.value))
         shadows = gui.add_checkbox("Shadows", True, hint="Without: faster where there is no GPU")
-        shadows.on_update(lambda _: self.scene.cast_shadows(shadows.value))
+        light = self.server.scene.configure_default_lights
+        shadows.on_update(lambda _: light(cast_shadow=shadows.value))
         seed = gui.add_number("Seed", session.seed, min=0, max=2**32 - 1, step=1)
         seed.on_update(lambda _: put(events.seed, int(seed.value)))
         if checkpoints:
             names, first = tuple(checkpoints), checkpoints[0]
             self.checkpoints = gui.add_dropdown("Checkpoint", names, initial_value=first)
-            self.checkpoints.on_update(lambda _: put(events.choose, self.checkpoints.value))
-        self._add_sliders(session)
+            chosen = self.checkpoints
+            chosen.on_update(lambda _: put(events.change, "chosen", chosen.value))
+        self._add_sliders(session, train)
         self._add_push()
         self._add_plots()
 
@@ -116,12 +112,18 @@ class Page:
                 x, y, z = (hard.value * part for part in WAYS[way.value])
                 self.put(events.push, (x, y, z))
 
-    def _add_sliders(self, session: Session) -> None:
+    def _add_sliders(self, session: Session, train: Callable[[], str]) -> None:
         gui, live = self.server.gui, session.program.live
         with gui.add_folder("Options of the environment"):
             self.words = gui.add_html("This environment's options have no numbers.")
-            self.train = gui.add_button("Train this", hint="Shows the command that trains it")
-            self.command = gui.add_html("", visible=False)
+            button = gui.add_button("Train this", hint="Shows the command that trains it")
+            told = gui.add_html("", visible=False)
+
+            @button.on_click
+            def _(_: Any) -> None:
+                _show(told, readouts.as_typed(train()))
+                told.visible = True
+
             for place in live:
                 self._add_slider(place, session.numbers[place], "acts at once")
         others = [place for place in session.numbers if place not in live]
@@ -152,14 +154,6 @@ class Page:
         self.server.gui.main_panel.dock_right()
         panel.dock_left()
         panel.set_width(PANEL_WIDTH)
-
-    def on_train(self, command: Callable[[], str]) -> None:
-        """Shows a command when it is asked for."""
-
-        @self.train.on_click
-        def _(_: Any) -> None:
-            _show(self.command, readouts.as_typed(command()))
-            self.command.visible = True
 
     def set_sliders(self, numbers: dict[Place, Any]) -> None:
         """Sets the sliders back to the numbers that are in use."""
@@ -201,22 +195,21 @@ class Page:
 
     def _draw_plots(self, session: Session) -> None:
         """Draws the lines; with fewer than two points uPlot has no scale, and they stay."""
-        for title, plot_of in PLOTS.items():
-            plot = plot_of(session)
+        for title, plot in readouts.plots(session).items():
             if len(plot.columns[0]) < 2:
                 continue
-            if title in self.plots:
-                self.plots[title].data = plot.columns
-                if self.names[title] != plot.names:
-                    self.plots[title].series = _series(plot.names)
-            else:
+            series = _series(plot.names)
+            if title not in self.plots:
                 with self.tab:
                     self.plots[title] = self.server.gui.add_uplot(
-                        data=plot.columns, series=_series(plot.names), title=title,
+                        data=plot.columns, series=series, title=title,
                         height=PLOT_HEIGHT, scales={"x": {"time": False}},
                         legend={"show": len(plot.names) <= len(COLORS)},
                     )  # fmt: skip
-            self.names[title] = plot.names
+            shown = self.plots[title]
+            shown.data = plot.columns
+            if shown.series != series:
+                shown.series = series
 
 
 def _series(names: Sequence[str]) -> tuple[Any, ...]:

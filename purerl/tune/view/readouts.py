@@ -1,12 +1,13 @@
 """What the page says of a session: plots, tables and lines; pure."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from purerl.report.html_elements import Html, element, join, table
 from purerl.tune.plan.episodes import TERM
-from purerl.tune.view.session import Session
+from purerl.tune.view.session import Row, Session
 
 MOST_POINTS = 200  # of a plot's line
 RECENT = 1.0  # what "per second" is taken over [s]
@@ -25,28 +26,21 @@ def terms_of(session: Session) -> tuple[str, ...]:
     return tuple(name for name in names if name.startswith(TERM))
 
 
-def reward_plot(session: Session) -> Plot:
-    """Returns the reward and its terms, per control step."""
-    terms = terms_of(session)
-    names = ("reward", *(term.removeprefix(TERM) for term in terms))
-    return _plot(session, names, lambda row: [row.reward, *(row.metrics[t] for t in terms)])
-
-
-def value_plot(session: Session) -> Plot:
-    """Returns the value that the driver expects."""
-    return _plot(session, ("value",), lambda row: [row.value])
-
-
-def action_plot(session: Session) -> Plot:
-    """Returns the actions."""
-    size = session.program.env.action_size
-    return _plot(session, tuple(f"a{i}" for i in range(size)), lambda row: list(row.action))
-
-
-def _plot(session: Session, names: tuple[str, ...], numbers) -> Plot:
+def plots(session: Session) -> dict[str, Plot]:
+    """Returns the reward and its terms, the value that the driver expects, and the actions."""
+    terms, size = terms_of(session), session.program.env.action_size
+    rewards = ("reward", *(term.removeprefix(TERM) for term in terms))
     rows = session.rows[:: -(-len(session.rows) // MOST_POINTS) or 1]
-    values = np.array([[row.time, *numbers(row)] for row in rows]).reshape(-1, 1 + len(names))
-    return Plot(names, tuple(np.ascontiguousarray(values.T)))
+
+    def plot(names: tuple[str, ...], numbers: Callable[[Row], list[Any]]) -> Plot:
+        values = np.array([[row.time, *numbers(row)] for row in rows]).reshape(-1, 1 + len(names))
+        return Plot(names, tuple(np.ascontiguousarray(values.T)))
+
+    return {
+        "Reward per step": plot(rewards, lambda x: [x.reward, *(x.metrics[t] for t in terms)]),
+        "Value": plot(("value",), lambda x: [x.value]),
+        "Actions": plot(tuple(f"a{i}" for i in range(size)), lambda x: [*x.action]),
+    }
 
 
 def reward_table(session: Session) -> Html:

@@ -28,10 +28,6 @@ class Scene:
         self.world: Any = None
         self.seen: Any = None  # the picture that is drawn
 
-    def cast_shadows(self, on: bool) -> None:
-        """Switches shadows, half of the work of a browser that draws without a GPU."""
-        self.server.scene.configure_default_lights(cast_shadow=on)
-
     def show(self, session: Session) -> None:
         """Draws a program's model anew; the camera stands as it did, if there was one."""
         first = self.world is None
@@ -40,7 +36,7 @@ class Scene:
         self.world = self.server.scene.add_frame(WORLD, show_axes=False)
         self.stage = Stage(session.program.env.physics.model)
         self.model, self.data = model, _ = self.stage.model, self.stage.data
-        shapes.pose(self.stage, session.picture)
+        self.stage.pose(session.picture)
         self.batches = shapes.batches(model)
         self.drawn = {n: shapes.layout(model, self.data, b) for n, b in self.batches.items()}
         self.handles = {name: self._add_batch(name) for name in self.batches}
@@ -62,7 +58,7 @@ class Scene:
         if session.picture is self.seen:
             return
         self.seen = session.picture
-        shapes.pose(self.stage, session.picture)
+        self.stage.pose(session.picture)
         with self.server.atomic():
             for name, batch in self.batches.items():
                 where = shapes.layout(self.model, self.data, batch)
@@ -93,7 +89,7 @@ class Scene:
     def _dragged(self, batch: shapes.Batch, event: Any) -> None:
         """Tells that the mouse draws at a part of a body, or lets it go."""
         if event.phase == "end":
-            self.put(events.release)
+            self.put(events.change, "grip", None)
             return
         start, end = (np.array(p) + self.offset for p in (event.start_position, event.end_position))
         geom = batch.geoms[(event.instance_index or 0) % len(batch.geoms)]

@@ -114,9 +114,9 @@ def step(session: Session) -> Session:
     return take_step(session._replace(playing=False, owed=0.0))
 
 
-def speed(session: Session, factor: float) -> Session:
-    """Lets so many simulated seconds pass in one of the clock."""
-    return session._replace(speed=factor)
+def change(session: Session, field: str, value: Any) -> Session:
+    """Sets one field: the `speed`, the checkpoint `chosen`, the `trouble` to tell, or no `grip`."""
+    return session._replace(**{field: value})
 
 
 def next_episode(session: Session) -> Session:
@@ -127,11 +127,6 @@ def next_episode(session: Session) -> Session:
 def seed(session: Session, seed: int) -> Session:
     """Starts the first episode of another seed."""
     return start_episode(session._replace(seed=seed), 0)
-
-
-def choose(session: Session, name: str) -> Session:
-    """Asks for another checkpoint: latest, best, or an update's number."""
-    return session._replace(chosen=name)
 
 
 def slide(session: Session, place: Place, value: int | float) -> Session:
@@ -156,11 +151,6 @@ def pull(session: Session, body: int, start: Any, target: Any) -> Session:
     return session._replace(grip=pushes.grip(_place(session), body, start, target))
 
 
-def release(session: Session) -> Session:
-    """Lets go."""
-    return session._replace(grip=None)
-
-
 def take_program(session: Session, program: Program) -> Session:
     """Takes a program for other numbers, which is ready."""
     return start_episode(session._replace(program=program), session.episode)
@@ -169,11 +159,6 @@ def take_program(session: Session, program: Program) -> Session:
 def take_brain(session: Session, brain: Any, checkpoint: str) -> Session:
     """Takes what was learned, of a checkpoint that has been read."""
     return session._replace(brain=brain, checkpoint=checkpoint, chosen="", trouble="")
-
-
-def refuse(session: Session, why: str) -> Session:
-    """Tells, in one line, why what a browser sent is not done."""
-    return session._replace(trouble=why)
 
 
 def fail(session: Session, why: str) -> Session:

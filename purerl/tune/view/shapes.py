@@ -57,13 +57,6 @@ class Layout(NamedTuple):
     scales: np.ndarray  # [N, 3]
 
 
-def pose(stage: renderer.Stage, picture: episode_pictures.Picture) -> None:
-    """Puts a stage's model into the place and form of a picture."""
-    stage.put(picture)
-    mujoco.mj_kinematics(stage.model, stage.data)
-    mujoco.mj_comPos(stage.model, stage.data)
-
-
 def batches(model: mujoco.MjModel) -> dict[str, Batch]:
     """Returns a model's visible geoms as batches, by name; planes and height fields are none."""
     found: dict[str, Batch] = {}
@@ -75,7 +68,7 @@ def batches(model: mujoco.MjModel) -> dict[str, Batch]:
                     parts.setdefault(name, []).append((geom, (0, 1, -1)[number]))
         for name, chosen in parts.items():
             geoms, sides = (np.array(column) for column in zip(*chosen, strict=True))
-            rgba = np.array([_rgba(model, geom) for geom in geoms])
+            rgba = np.clip([renderer.color_of(model, geom) for geom in geoms], 0.0, 1.0)
             colors, opacities = (255 * rgba[:, :3]).astype(np.uint8), rgba[:, 3].astype(np.float32)
             batch = Batch(_mesh(model, name), name, geoms, sides, colors, opacities, moving)
             found[f"{'body' if moving else 'ground'}/{name}"] = batch
@@ -83,7 +76,7 @@ def batches(model: mujoco.MjModel) -> dict[str, Batch]:
 
 
 def layout(model: mujoco.MjModel, data: mujoco.MjData, batch: Batch) -> Layout:
-    """Returns where a batch's parts are in a model that `pose` has put into place."""
+    """Returns where a batch's parts are in a model that a `Stage` has put into place."""
     geoms, size = batch.geoms, model.geom_size[batch.geoms]
     rotations = data.geom_xmat[geoms].reshape(-1, 3, 3)
     along = (batch.sides * size[:, 1])[:, None] * rotations[:, :, 2]
@@ -116,20 +109,7 @@ def planes(model: mujoco.MjModel) -> list[int]:
 
 
 def _is_shown(model: mujoco.MjModel, geom: int) -> bool:
-    return bool(model.geom_group[geom] < SHOWN_GROUPS and _rgba(model, geom)[3] > 0)
-
-
-def _rgba(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Returns a geom's color [4] in [0, 1]: its material's, unless it has one of its own."""
-    material, own = model.geom_matid[geom], model.geom_rgba[geom]
-    plain = material < 0 or not np.allclose(own, 0.5 * np.array([1, 1, 1, 2]))
-    rgba = own if plain else model.mat_rgba[material].copy()
-    if not plain and (texture := model.mat_texid[material].max()) >= 0:
-        start, depth = model.tex_adr[texture], model.tex_nchannel[texture]
-        size = model.tex_height[texture] * model.tex_width[texture] * depth
-        pixels = model.tex_data[start : start + size].reshape(-1, depth)
-        rgba[: min(depth, 3)] *= pixels.mean(axis=0)[:3] / 255  # a browser's mesh has one color
-    return np.clip(rgba, 0.0, 1.0)
+    return bool(model.geom_group[geom] < SHOWN_GROUPS and renderer.color_of(model, geom)[3] > 0)
 
 
 def _part_names(model: mujoco.MjModel, geom: int) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ import pytest
 from purerl import load, run
 from purerl.core.errors import INTERRUPTED
 from purerl.core.keys import Purpose, derive, per_environment
-from purerl.plan import main, same
+from purerl.plan import main
 from purerl.tune.plan import figures
 from tests.tune.plan.toys import Point
 
@@ -201,10 +201,3 @@ def test_toys_keep_the_contract():
     from purerl import check_env
 
     check_env(Point())
-
-
-def test_starts_of_another_structure_are_others():
-    some = {"a": np.zeros(2), "b": np.ones(1)}
-    assert same(some, {"a": np.zeros(2), "b": np.ones(1)})
-    assert not same(some, {"a": np.zeros(2), "b": np.zeros(1)})
-    assert not same(some, {"a": np.zeros(2)})

@@ -60,7 +60,7 @@ NAMES = [
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_the_page_does_not_offer_is_told_in_it(one, watched, name):
-    one.page.put(events.refuse, "")
+    one.page.put(events.change, "trouble", "")
     one.wait(lambda: not one.session.trouble)
     hostile.send(watched, hostile.known(one)[name])
     one.wait(lambda: "A browser sent what this page does not offer: " in one.session.trouble)
@@ -68,7 +68,7 @@ def test_what_the_page_does_not_offer_is_told_in_it(one, watched, name):
 
 
 def test_what_it_offers_is_done(one, watched):
-    one.page.put(events.refuse, "")
+    one.page.put(events.change, "trouble", "")
     hostile.send(watched, hostile.move(one.name("Seed"), value=7))
     one.wait(lambda: one.session.seed == 7)
     hostile.send(watched, hostile.move(one.name("Speed"), value="4"))

@@ -69,7 +69,7 @@ def test_the_shown_command_makes_the_setting():
     assert made == dataclasses.replace(
         chosen, env=dataclasses.replace(env, forward_weight=0.3)
     )  # a slider's 0.30000000000000004
-    assert overrides.environment_words(source.experiment, source.experiment.env) == []
+    assert overrides.option_words("env", source.experiment.env, source.experiment.env) == []
 
 
 def test_a_flag_that_is_on_is_switched_off_by_its_no():
@@ -140,7 +140,7 @@ def test_a_capsule_is_a_rod_between_two_spheres():
     capsule = '<geom type="capsule" size="0.1 0.5" euler="0 90 0" pos="0 0 1"/>'
     stage = Stage(model_of(f"<body><freejoint/>{capsule}</body>"))
     model, data = stage.model, stage.data
-    shapes.pose(stage, Picture(model.qpos0, np.zeros((0, 3)), np.zeros((0, 4)), {}, ()))
+    stage.pose(Picture(model.qpos0, np.zeros((0, 3)), np.zeros((0, 4)), {}, ()))
     found = shapes.batches(model)
     assert set(found) == {"body/rod", "body/sphere"}
     balls = shapes.layout(model, data, found["body/sphere"])
@@ -159,7 +159,7 @@ def test_an_episodes_own_boxes_are_where_its_physics_has_them():
         position, size = model.geom_pos.copy(), model.geom_size.copy()
         position[found.geoms[1], 0], size[found.geoms[1], 0] = x, half
         changes = {"geom_pos": position, "geom_size": size}
-        shapes.pose(stage, Picture(model.qpos0, np.zeros((0, 3)), np.zeros((0, 4)), changes, ()))
+        stage.pose(Picture(model.qpos0, np.zeros((0, 3)), np.zeros((0, 4)), changes, ()))
         drawn.append(shapes.layout(model, data, found))
     assert [float(each.positions[1, 0]) for each in drawn] == [7.0, 9.0]
     assert [float(each.scales[1, 0]) for each in drawn] == [np.float32(0.9), np.float32(0.4)]

@@ -64,7 +64,7 @@ def test_steps_are_taken_as_time_passes():
         session = s.advance(session, [(s.tick, 0.03)])
     assert session.length == 15 and session.picture.qpos[0] == 15
     assert s.advance(session._replace(speed=0.5), [(s.tick, 0.04)]).length == 16
-    assert s.advance(session, [(s.speed, 2.0), (s.tick, 0.04)]).length == 19
+    assert s.advance(session, [(s.change, "speed", 2.0), (s.tick, 0.04)]).length == 19
 
 
 def test_a_slow_computer_owes_no_more_than_a_moment():
@@ -139,11 +139,11 @@ def test_what_cannot_be_built_is_told_and_taken_back():
 
 
 def test_another_checkpoint_goes_on_with_the_episode():
-    session = s.advance(opened(), [(s.tick, 0.1), (s.choose, "7")])
+    session = s.advance(opened(), [(s.tick, 0.1), (s.change, "chosen", "7")])
     assert session.chosen == "7"
     session = s.advance(session, [(s.take_brain, 10.0, "of update 7"), (s.step,)])
     assert session.rows[-1].reward == 20.0 and session.length == 6 and session.chosen == ""
-    failed = s.advance(session, [(s.choose, "8"), (s.fail, "The checkpoint is damaged.")])
+    failed = s.advance(session, [(s.change, "chosen", "8"), (s.fail, "The checkpoint is damaged.")])
     assert failed.chosen == "" and failed.brain == 10.0 and "damaged" in failed.trouble
 
 
@@ -155,7 +155,7 @@ def test_slow_work_is_begun_once_and_told(monkeypatch):
         program=lambda numbers: program(width=numbers[WIDTH]), brain=broken
     )
     beside = loop.Beside()
-    session = s.advance(opened(), [(s.choose, "best"), (s.slide, WIDTH, 0.75)])
+    session = s.advance(opened(), [(s.change, "chosen", "best"), (s.slide, WIDTH, 0.75)])
     loop.begin_work(session, source, beside)
     assert beside.words.startswith("reading checkpoint best")
     beside.work.result(10)
@@ -180,7 +180,7 @@ def test_a_push_and_a_pull_change_the_velocity():
     assert session.moment.env.physics.qvel[0] > 0.5
     held = s.advance(session, [(s.pull, 1, (0, 0, 0), (0, 0, -1))])
     np.testing.assert_allclose(held.grip.target, [0, 0, -1])
-    free = s.advance(session, [(s.release,)])
+    free = s.advance(session, [(s.change, "grip", None)])
     assert free.grip is None
     before = free.moment.env.physics.qvel
     assert s.advance(free, [(s.step,)]).moment.env.physics.qvel is before
@@ -207,12 +207,12 @@ def test_plots_have_a_line_each_and_few_points():
     session = opened()
     for _ in range(150):
         session = s.advance(session, [(s.tick, 0.1)])
-    plot = readouts.reward_plot(session)
+    plot = readouts.plots(session)["Reward per step"]
     assert plot.names == ("reward", "run", "cost") and len(plot.columns) == 4
     assert len(plot.columns[0]) <= readouts.MOST_POINTS
     assert np.ptp(plot.columns[0]) == pytest.approx(s.SECONDS_KEPT, abs=0.1)
-    assert readouts.action_plot(session).names == ("a0", "a1")
-    assert len(readouts.value_plot(opened()).columns[0]) == 0
+    assert readouts.plots(session)["Actions"].names == ("a0", "a1")
+    assert len(readouts.plots(opened())["Value"].columns[0]) == 0
 
 
 def test_the_state_is_told_in_lines():
