@@ -44,7 +44,10 @@ def own_experiment(folder: Path) -> Path:
 # --- playing ---
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow) if n.startswith("rodent") else n for n in NAMES],
+)  # compiling a rodent's first state takes 20 s
 def test_it_opens_in_silence_and_acts(name, elsewhere, capsys, monkeypatch):
     monkeypatch.setattr(restored_run, "_changed_since", lambda *_: ["The code"])
     run = purerl.load(name)
