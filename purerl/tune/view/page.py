@@ -99,7 +99,13 @@ class Page:
             chosen.on_update(lambda _: put(events.change, "chosen", chosen.value))
         self._add_sliders(session, train)
         self._add_push()
-        self._add_plots()
+        panel = self.server.gui.add_panel()
+        self.tab = panel.add_tab("Live")
+        with self.tab:  # whatever grows is here, so that no button moves under the mouse
+            self.said = self.server.gui.add_html("opening")
+        self.server.gui.main_panel.dock_right()
+        panel.dock_left()
+        panel.set_width(PANEL_WIDTH)
 
     def _add_push(self) -> None:
         gui = self.server.gui
@@ -145,15 +151,6 @@ class Page:
         if value != self.numbers[place]:
             self.numbers[place] = value
             self.put(events.slide, place, value)
-
-    def _add_plots(self) -> None:
-        panel = self.server.gui.add_panel()
-        self.tab = panel.add_tab("Live")
-        with self.tab:  # whatever grows is here, so that no button moves under the mouse
-            self.said = self.server.gui.add_html("opening")
-        self.server.gui.main_panel.dock_right()
-        panel.dock_left()
-        panel.set_width(PANEL_WIDTH)
 
     def set_sliders(self, numbers: dict[Place, Any]) -> None:
         """Sets the sliders back to the numbers that are in use."""
