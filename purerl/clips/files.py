@@ -1,0 +1,186 @@
+"""Files of recorded motion, in HDF5: two layouts are read, the named one is written.
+
+named   all_clips/joints [C, T, J], /position [C, T, 3], /quaternion [C, T, 4] and, to be compared
+        with, /body_positions [C, T, B, 3]; metadata/joint_names, /body_names. purerl adds
+        metadata/clip_names, /clip_lengths and the attribute `rate` of all_clips [Hz].
+flat    qpos [N, K], names_qpos [K] (a free joint is seven columns of one name), xpos [N, B, 3],
+        names_xpos [B], config (YAML): all clips one after the other, of one length.
+"""
+
+import contextlib
+import io
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from purerl.clips import body
+from purerl.clips.records import Clips, Motion, shortened
+from purerl.core.errors import UserError, reason
+from purerl.machine import files
+from purerl.machine.command_errors import check_installed
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"  # at the beginning, or after a block of up to 2048 bytes
+
+
+def read(path: Path | str, rate: float = 0.0, frames: int = 0) -> Motion:
+    """Reads a file of clips.
+
+    Args:
+      path: an HDF5 file of either layout.
+      rate: at which it was recorded [Hz], where the file does not say so.
+      frames: of each clip of a flat file, where it does not say so.
+
+    Raises:
+      UserError: the file is not one, or cut short, or lacks something, or holds what is no number;
+        or `rate` is neither here nor there, or another.
+    """
+    check_installed("h5py", "clips")
+    import h5py
+
+    path = Path(path)
+    try:
+        with files.open_file(path) as opened:
+            begin = opened.read(4096)
+            if SIGNATURE not in begin:
+                raise UserError(f"{path} is no HDF5 file: it begins with {begin[:8]!r}.")
+            with h5py.File(opened, "r") as file:
+                named = "all_clips" in file
+                motion = _read_named(path, file) if named else _read_flat(path, file, frames)
+    except (OSError, RuntimeError) as error:
+        broken = "cannot be read" if getattr(error, "errno", None) else "is cut short or broken"
+        raise UserError(f"{path} {broken}: {reason(error)}.") from error
+    _check_values(path, motion)
+    if not (motion.rate or rate):
+        raise UserError(f"{path} does not say its rate: give it, as rate=50 or --rate 50 [Hz].")
+    if motion.rate and rate and motion.rate != rate:
+        raise UserError(f"{path} is of {motion.rate:g} Hz, not {rate:g}: leave the rate out.")
+    return motion._replace(rate=motion.rate or float(rate))
+
+
+def _array(path: Path, file: Any, name: str, dims: int, begin: tuple[int, ...] = ()) -> Any:
+    """Returns a dataset of so many dimensions, the first ones `begin`; texts as str."""
+    if name not in file:
+        there: list[str] = []
+        file.visit(there.append)
+        raise UserError(f"{path} lacks {name}; there are: {shortened(there, 30) or 'none'}.")
+    found = np.asarray(file[name])
+    if found.ndim != dims or found.shape[: len(begin)] != begin:
+        must = f"have {dims} dimensions" + f", the first {list(begin)}" * bool(begin)
+        raise UserError(f"{path}: {name} is of shape {list(found.shape)}; it must {must}.")
+    if found.dtype.kind not in "SO":
+        return found
+    return tuple(x.decode() if isinstance(x, bytes) else str(x) for x in found)
+
+
+def _read_named(path: Path, file: Any) -> Motion:
+    joints = _array(path, file, "all_clips/joints", 3)
+    number, most, width = joints.shape
+    columns = _array(path, file, "metadata/joint_names", 1, (width,))
+    if "all_clips/position" in file or "all_clips/quaternion" in file:
+        root = ("all_clips/position", "all_clips/quaternion")
+        parts = [_array(path, file, name, 3, (number, most)) for name in root]
+        columns, joints = (body.ROOT,) * 7 + columns, np.concatenate([*parts, joints], -1)
+    names, lengths, bodies, positions = _numbered(number), np.full(number, most), (), None
+    if "metadata/clip_names" in file:
+        names = _array(path, file, "metadata/clip_names", 1, (number,))
+    if "metadata/clip_lengths" in file:
+        lengths = _array(path, file, "metadata/clip_lengths", 1, (number,))
+    if "all_clips/body_positions" in file:
+        positions = _array(path, file, "all_clips/body_positions", 4, (number, most))
+        bodies = _array(path, file, "metadata/body_names", 1, positions.shape[2:3])
+    rate = float(file["all_clips"].attrs.get("rate", 0.0))
+    return Motion(columns, joints, lengths, names, rate, bodies, positions)
+
+
+def _read_flat(path: Path, file: Any, frames: int) -> Motion:
+    qpos, config = _array(path, file, "qpos", 2), _config(file)
+    names = tuple(map(str, config.get("model", {}).get("snips_order", ())))
+    frames = frames or config.get("stac", {}).get("n_frames_per_clip", 0)
+    frames = frames or len(qpos) // max(1, len(names)) * bool(names)
+    if not frames:
+        raise UserError(f"{path} does not say how long its clips are: give it, as --frames 250.")
+    number = len(qpos) // frames
+    if number * frames != len(qpos) or len(names) not in (0, number):
+        told = f" and the names of {len(names)} clips" * bool(names)
+        raise UserError(f"{path} has {len(qpos)} frames{told}: no clips of {frames} frames each.")
+    columns = _array(path, file, "names_qpos", 1, qpos.shape[1:])
+    bodies, positions = (), None
+    if "xpos" in file:
+        positions = _array(path, file, "xpos", 3, qpos.shape[:1])
+        bodies = _array(path, file, "names_xpos", 1, positions.shape[1:2])
+        positions = positions.reshape(number, frames, -1, 3)
+    values, lengths = qpos.reshape(number, frames, -1), np.full(number, frames)
+    return Motion(columns, values, lengths, names or _numbered(number), 0.0, bodies, positions)
+
+
+def _numbered(number: int) -> tuple[str, ...]:
+    return tuple(f"clip_{i:04d}" for i in range(number))
+
+
+def _config(file: Any) -> dict[str, Any]:
+    """Returns a flat file's own settings; what cannot be understood is as if it were not there."""
+    import yaml
+
+    with contextlib.suppress(KeyError, AttributeError, yaml.YAMLError):
+        found = yaml.safe_load(file["config"][()])
+        return {name: group for name, group in found.items() if isinstance(group, dict)}
+    return {}
+
+
+def _check_values(path: Path, motion: Motion) -> None:
+    """Raises UserError for names that are not different, wrong lengths, and what is no number."""
+    most = motion.values.shape[1]
+    if not 0 < len(set(motion.names)) == len(motion.names):
+        raise UserError(f"{path} has clips of one name, or none: {shortened(motion.names)}.")
+    for name, length, x in zip(motion.names, motion.lengths, motion.values, strict=True):
+        if not 1 <= length <= most:
+            raise UserError(f"{path}: clip {name!r} has {length} frames; it must be 1 to {most}.")
+        if len(wrong := np.argwhere(~np.isfinite(x[:length]))):
+            what = f"{motion.columns[wrong[0, 1]]!r} is {x[tuple(wrong[0])]} at frame {wrong[0, 0]}"
+            raise UserError(f"{path}: clip {name!r}: {what}.")
+
+
+def write(path: Path, clips: Clips, model: mujoco.MjModel) -> None:
+    """Writes clips in the named layout, with velocities and with where the body's parts are.
+
+    Angular velocities are in the body's own frame, as in MuJoCo's qvel.
+
+    Args:
+      path: the file, written whole or not at all.
+      clips: the clips.
+      model: of their body.
+
+    Raises:
+      UserError: the file cannot be written, or the body has a ball joint, which this layout has
+        not.
+    """
+    check_installed("h5py", "clips")
+    import h5py
+
+    places = body.joint_places(model)
+    root = places.pop(body.ROOT, [])[:1]
+    if balls := [name for name, place in places.items() if len(place) > 1]:
+        raise UserError(f"This layout has no ball joints: {shortened(balls)}.")
+    joints = [start for start, *_ in places.values()]
+    dofs = dict(zip(model.jnt_qposadr.tolist(), model.jnt_dofadr.tolist(), strict=True))
+    qpos, qvel = np.asarray(clips.qpos), np.asarray(clips.qvel)
+    arrays = {"joints": qpos[..., joints], "joints_velocity": qvel[..., [dofs[i] for i in joints]]}
+    for i in root:
+        arrays |= {"position": qpos[..., i : i + 3], "quaternion": qpos[..., i + 3 : i + 7]}
+        speeds = qvel[..., dofs[i] : dofs[i] + 6]
+        arrays |= {"velocity": speeds[..., :3], "angular_velocity": speeds[..., 3:]}
+    parts = np.stack([body.kinematics(model, track)[1] for track in qpos])
+    arrays |= {"body_positions": parts[..., :3], "body_quaternions": parts[..., 3:]}
+    names = body.kinematics(model, qpos[0, :1])[0]
+    texts = {"joint_names": list(places), "body_names": names, "clip_names": clips.names}
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        for name, x in arrays.items():
+            file.create_dataset(f"all_clips/{name}", data=x.astype(np.float32), compression="gzip")
+        for name, words in texts.items():
+            file[f"metadata/{name}"] = np.array([word.encode() for word in words], "S")
+        file["metadata/clip_lengths"] = np.asarray(clips.lengths)
+        file["all_clips"].attrs["rate"] = clips.rate
+    files.write_answer(path, content.getvalue())
