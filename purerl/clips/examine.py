@@ -7,7 +7,6 @@ import numpy as np
 
 from purerl.clips import body
 from purerl.clips.records import Motion, behaviour_of
-from purerl.physics import lookup
 
 # Numbers [L, n] of a track's frames, and the n names that they are of.
 Measure = tuple[np.ndarray, list[str]]
@@ -22,28 +21,19 @@ def about(motion: Motion, clip: int) -> str:
 
 def examine(motion: Motion, model: mujoco.MjModel, allow: Sequence[str] = ()) -> Iterator[str]:
     """Yields a line about each clip with what is most odd in it; see `body.fit` for `allow`."""
-    shared = [n for n in body.kinematics(model, model.qpos0[None])[0] if n in _parts(motion)]
     for i, qpos in enumerate(body.poses(motion, model, allow)):
-        measures = {
-            "m/s": (body.speeds(model, qpos, motion.rate)[:, None], ["root"]),
-            "mm below the floor": below_floor(model, qpos),
-            "deg beyond the range": beyond_ranges(model, qpos),
-            "mm from the file's own positions": from_positions(motion, i, model, qpos, shared),
-        }
-        yield "; ".join(
-            [
-                about(motion, i),
-                *(worst(x, names, what) for what, (x, names) in measures.items() if names),
-            ]
-        )
-    if not shared:
-        yield "The clips have no positions of this model's bodies, so none were compared."
-    if not floor(model).any():
-        yield "The model has no floor, so none was looked for: name an experiment."
+        fast = body.speeds(model, qpos, motion.rate)[:, None]
+        said = [about(motion, i), worst(fast, ["root"], "m/s")]
+        said += [worst(*below_floor(model, qpos), "mm below the floor")]
+        said += [worst(*beyond_ranges(model, qpos), "deg beyond the range")]
+        said += [worst(*from_positions(motion, i, model, qpos), "mm from the file's positions")]
+        yield "; ".join(said)
 
 
 def worst(values: np.ndarray, names: list[str], what: str) -> str:
     """Returns the largest of numbers [L, n] in words: what it measures, of what, in which frame."""
+    if not values.size:
+        return f"unknown {what}"
     frame, number = np.unravel_index(values.argmax(), values.shape)
     largest = max(0.0, float(values.max()))
     return f"{largest:.2f} {what}" + f" ({names[number]}, frame {frame})" * (largest > 0)
@@ -64,8 +54,8 @@ def below_floor(model: mujoco.MjModel, qpos: np.ndarray) -> Measure:
         touching = still[pairs].sum(axis=1) == 1
         for geom in pairs[touching].T:
             np.maximum.at(row, geom, -1e3 * data.contact.dist[touching])
-    deep[:, still] = 0.0
-    return deep, [body.bare(name) for name in lookup.names(model, "geom")] if still.any() else []
+    own = np.flatnonzero(~still & still.any())
+    return deep[:, own], [body.bare(model.geom(i).name) for i in own]
 
 
 def beyond_ranges(model: mujoco.MjModel, qpos: np.ndarray) -> Measure:
@@ -77,17 +67,11 @@ def beyond_ranges(model: mujoco.MjModel, qpos: np.ndarray) -> Measure:
     return beyond, [body.bare(model.joint(i).name) for i in limited]
 
 
-def from_positions(
-    motion: Motion, clip: int, model: mujoco.MjModel, qpos: np.ndarray, shared: list[str]
-) -> Measure:
+def from_positions(motion: Motion, clip: int, model: mujoco.MjModel, qpos: np.ndarray) -> Measure:
     """Returns how far bodies are from where the file says, by kinematics of its own joints [mm]."""
     own, places = body.kinematics(model, qpos)
-    if motion.positions is None or not shared:
-        return places[..., 0], []
-    told = motion.positions[clip, : len(qpos), [_parts(motion).index(n) for n in shared]]
-    apart = told.swapaxes(0, 1) - places[:, [own.index(n) for n in shared], :3]
+    theirs = [body.bare(name) for name in motion.bodies]
+    shared = [name for name in own if name in theirs]
+    told = motion.positions[clip, : len(qpos)][:, [theirs.index(name) for name in shared]]
+    apart = told - places[:, [own.index(name) for name in shared], :3]
     return 1e3 * np.linalg.norm(apart, axis=-1), shared
-
-
-def _parts(motion: Motion) -> list[str]:
-    return [body.bare(name) for name in motion.bodies]

@@ -8,6 +8,7 @@ flat    qpos [N, K], names_qpos [K] (a free joint is seven columns of one name),
 """
 
 import contextlib
+import functools
 import io
 from pathlib import Path
 from typing import Any
@@ -59,8 +60,15 @@ def read(path: Path | str, rate: float = 0.0, frames: int = 0) -> Motion:
     return motion._replace(rate=motion.rate or float(rate))
 
 
-def _array(path: Path, file: Any, name: str, dims: int, begin: tuple[int, ...] = ()) -> Any:
-    """Returns a dataset of so many dimensions, the first ones `begin`; texts as str."""
+def _array(
+    path: Path, file: Any, name: str, dims: int, begin: tuple[int, ...] = (), other: Any = None
+) -> Any:
+    """Returns a dataset of so many dimensions, the first ones `begin`; texts as str.
+
+    Where there is none it is `other`, and a UserError if that is None.
+    """
+    if name not in file and other is not None:
+        return other
     if name not in file:
         there: list[str] = []
         file.visit(there.append)
@@ -75,27 +83,24 @@ def _array(path: Path, file: Any, name: str, dims: int, begin: tuple[int, ...] =
 
 
 def _read_named(path: Path, file: Any) -> Motion:
-    joints = _array(path, file, "all_clips/joints", 3)
-    number, most, width = joints.shape
-    columns = _array(path, file, "metadata/joint_names", 1, (width,))
+    get = functools.partial(_array, path, file)
+    values = get("all_clips/joints", 3)
+    clips, width = values.shape[:2], values.shape[2:]
+    columns = get("metadata/joint_names", 1, width)
     if "all_clips/position" in file or "all_clips/quaternion" in file:
-        root = ("all_clips/position", "all_clips/quaternion")
-        parts = [_array(path, file, name, 3, (number, most)) for name in root]
-        columns, joints = (body.ROOT,) * 7 + columns, np.concatenate([*parts, joints], -1)
-    names, lengths, bodies, positions = _numbered(number), np.full(number, most), (), None
-    if "metadata/clip_names" in file:
-        names = _array(path, file, "metadata/clip_names", 1, (number,))
-    if "metadata/clip_lengths" in file:
-        lengths = _array(path, file, "metadata/clip_lengths", 1, (number,))
-    if "all_clips/body_positions" in file:
-        positions = _array(path, file, "all_clips/body_positions", 4, (number, most))
-        bodies = _array(path, file, "metadata/body_names", 1, positions.shape[2:3])
+        root = [get(f"all_clips/{name}", 3, clips) for name in ("position", "quaternion")]
+        columns, values = (body.ROOT,) * 7 + columns, np.concatenate([*root, values], -1)
+    names = get("metadata/clip_names", 1, clips[:1], _numbered(clips[0]))
+    lengths = get("metadata/clip_lengths", 1, clips[:1], np.full(*clips))
+    positions = get("all_clips/body_positions", 4, clips, np.zeros((*clips, 0, 3)))
+    bodies = get("metadata/body_names", 1, positions.shape[2:3]) if positions.size else ()
     rate = float(file["all_clips"].attrs.get("rate", 0.0))
-    return Motion(columns, joints, lengths, names, rate, bodies, positions)
+    return Motion(columns, values, lengths, names, rate, bodies, positions)
 
 
 def _read_flat(path: Path, file: Any, frames: int) -> Motion:
-    qpos, config = _array(path, file, "qpos", 2), _config(file)
+    get, config = functools.partial(_array, path, file), _config(file)
+    qpos = get("qpos", 2)
     names = tuple(map(str, config.get("model", {}).get("snips_order", ())))
     frames = frames or config.get("stac", {}).get("n_frames_per_clip", 0)
     frames = frames or len(qpos) // max(1, len(names)) * bool(names)
@@ -105,14 +110,11 @@ def _read_flat(path: Path, file: Any, frames: int) -> Motion:
     if number * frames != len(qpos) or len(names) not in (0, number):
         told = f" and the names of {len(names)} clips" * bool(names)
         raise UserError(f"{path} has {len(qpos)} frames{told}: no clips of {frames} frames each.")
-    columns = _array(path, file, "names_qpos", 1, qpos.shape[1:])
-    bodies, positions = (), None
-    if "xpos" in file:
-        positions = _array(path, file, "xpos", 3, qpos.shape[:1])
-        bodies = _array(path, file, "names_xpos", 1, positions.shape[1:2])
-        positions = positions.reshape(number, frames, -1, 3)
-    values, lengths = qpos.reshape(number, frames, -1), np.full(number, frames)
-    return Motion(columns, values, lengths, names or _numbered(number), 0.0, bodies, positions)
+    columns, lengths = get("names_qpos", 1, qpos.shape[1:]), np.full(number, frames)
+    positions = get("xpos", 3, qpos.shape[:1], np.zeros((len(qpos), 0, 3)))
+    bodies = get("names_xpos", 1, positions.shape[1:2]) if positions.size else ()
+    values, places = (x.reshape(number, frames, *x.shape[1:]) for x in (qpos, positions))
+    return Motion(columns, values, lengths, names or _numbered(number), 0.0, bodies, places)
 
 
 def _numbered(number: int) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ class Motion(NamedTuple):
     names: tuple[str, ...]  # C, all different
     rate: float  # frames a second [Hz]
     bodies: tuple[str, ...]  # B
-    positions: np.ndarray | None  # [C, T, B, 3] of the bodies [m], where the file has them
+    positions: np.ndarray  # [C, T, B, 3] of the bodies [m]
 
 
 class Clips(NamedTuple):
