@@ -144,7 +144,7 @@ def _check_values(path: Path, motion: Motion) -> None:
             raise UserError(f"{path}: clip {name!r}: {what}.")
 
 
-def write(path: Path, clips: Clips, model: mujoco.MjModel) -> None:
+def write(path: Path | str, clips: Clips, model: mujoco.MjModel) -> None:
     """Writes clips in the named layout, with velocities and with where the body's parts are.
 
     Angular velocities are in the body's own frame, as in MuJoCo's qvel.
@@ -185,4 +185,4 @@ def write(path: Path, clips: Clips, model: mujoco.MjModel) -> None:
             file[f"metadata/{name}"] = np.array([word.encode() for word in words], "S")
         file["metadata/clip_lengths"] = np.asarray(clips.lengths)
         file["all_clips"].attrs["rate"] = clips.rate
-    files.write_answer(path, content.getvalue())
+    files.write_answer(Path(path), content.getvalue())

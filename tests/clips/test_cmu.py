@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-h5py = pytest.importorskip("h5py", reason="pip install -e '.[clips]'")
+pytest.importorskip("h5py", reason="pip install -e '.[clips]'")
 
+import h5py
 import mujoco
 from dm_control.locomotion import mocap
 from dm_control.locomotion.arenas import floors
@@ -53,7 +54,7 @@ def test_a_person_is_where_the_file_says(person):
     for line in (walk, roll):
         assert "; 0.00 mm from the file's positions (" in line
     # Left for right is seen at once.
-    flip = [{"lradiusrx": "rradiusrx", "rradiusrx": "lradiusrx"}.get(n, n) for n in motion.columns]
+    flip = [{"lfemurrx": "rfemurrx", "rfemurrx": "lfemurrx"}.get(n, n) for n in motion.columns]
     wrong, _ = examine.examine(motion._replace(columns=tuple(flip)), model)
     assert float(wrong.split(" mm from")[0].rpartition(" ")[2]) > 1.0
 

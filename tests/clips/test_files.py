@@ -55,7 +55,7 @@ def test_what_is_written_has_the_keys_of_the_layout_and_where_the_body_is(tmp_pa
     bodies.write(tmp_path / "a.h5", bodies.named_arrays(1))
     fitted = clips.fit(clips.read(tmp_path / "a.h5", rate=50.0), model, 50.0)
     clips.write(tmp_path / "b.h5", fitted, model)
-    clips.write(tmp_path / "c.h5", fitted, model)
+    clips.write(str(tmp_path / "c.h5"), fitted, model)
     assert (tmp_path / "b.h5").read_bytes() == (tmp_path / "c.h5").read_bytes()
     names, xpos = bodies.places(np.stack(bodies.tracks((16,))))
     with h5py.File(tmp_path / "b.h5") as file:
