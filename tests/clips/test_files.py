@@ -34,6 +34,8 @@ def test_clips_of_different_lengths_come_back_with_all_their_bits(tmp_path, mode
     tracks = [np.tile(model.qpos0, (len(x), 1)) for x in bodies.tracks()]
     for whole, x in zip(tracks, bodies.tracks(), strict=True):
         whole[:, :9] = x
+        turns = np.random.default_rng(0).normal(size=(len(x), 4)).astype(np.float32)
+        whole[:, 3:7] = turns / np.linalg.norm(turns, axis=1, keepdims=True)
     packed = clips.pack(model, tracks, ("Walk_1", "Rear_2", "Walk_3"), bodies.RATE)
     clips.write(tmp_path / "a.h5", packed, model)
     motion = clips.read(tmp_path / "a.h5")

@@ -89,6 +89,13 @@ def test_clips_are_drawn_by_their_weights_and_frames_with_a_whole_window():
     assert (draws(2 * weights, lengths, 5)[0] == clip).all()
 
 
+def test_no_number_draws_a_clip_of_weight_zero(monkeypatch):
+    weights, lengths = jnp.array([0.0, 1.0, 3.0, 0.0]), jnp.array([9, 5, 8, 9])
+    for clip, number in ((1, lambda key, shape, low, high: low), (2, lambda *of: of[-1] - 1)):
+        monkeypatch.setattr(jax.random, "randint", number)
+        assert clips.draw(jax.random.key(0), weights, lengths, 5)[0] == clip
+
+
 def test_no_clip_of_many_is_left_out_and_no_sum_overflows():
     weights = jnp.ones(5000).at[0].set(1e-7)
     clip, _ = draws(weights, jnp.full(5000, 9), 5, 20000)
