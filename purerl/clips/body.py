@@ -39,8 +39,8 @@ def poses(motion: Motion, model: mujoco.MjModel, allow: Sequence[str] = ()) -> l
     for i, name in enumerate(motion.columns):
         offered.setdefault(ROOT if motion.columns.count(name) == 7 else bare(name), []).append(i)
     _check_joints(offered, wanted, set(allow))
-    shared = [name for name in wanted if name in offered]
-    places, columns = (sum((of[name] for name in shared), []) for of in (wanted, offered))
+    shared = [n for n in wanted if len(wanted[n]) == len(offered.get(n, ()))]
+    places, columns = (sum((of[n] for n in shared), []) for of in (wanted, offered))
     tracks = []
     for name, length, values in zip(motion.names, motion.lengths, motion.values, strict=True):
         qpos = np.tile(model.qpos0, (length, 1))
@@ -49,24 +49,22 @@ def poses(motion: Motion, model: mujoco.MjModel, allow: Sequence[str] = ()) -> l
         for row in fixed:
             mujoco.mj_normalizeQuat(model, row)
         if (off := np.abs(fixed - qpos).max(axis=1)).max() > 0.01:
-            raise UserError(
-                f"Clip {name!r}: the quaternion of frame {off.argmax()} is not of norm 1."
-            )
+            raise UserError(f"Clip {name!r}, frame {off.argmax()}: a quaternion is not of norm 1.")
         # What float32 rounded, keeps its bits.
         tracks.append(np.where(off[:, None] > 1e-6, fixed, qpos))
     return tracks
 
 
 def _check_joints(offered: dict[str, list], wanted: dict[str, list], allow: set[str]) -> None:
-    if not wanted.keys() & offered.keys() - {ROOT}:
+    shared = wanted.keys() & offered.keys()
+    if not shared - {ROOT} and shared != wanted.keys():
         both = f"their joints ({shortened(offered)}) is one of this one's ({shortened(wanted)})"
         raise UserError(f"The clips are of another body: none of {both}.")
-    missing, left = (
-        [n for n in a if n not in b] for a, b in ((wanted, offered), (offered, wanted))
-    )
-    wrong = [n for n in wanted if n in offered and len(wanted[n]) != len(offered[n])]
-    sides = {"lack joints of the body": missing, "have joints that it has not": left}
-    sides |= {"have as many columns as it has numbers not of": wrong}
+    sides = {
+        "lack joints of the body": [n for n in wanted if n not in offered],
+        "have joints that it has not": [n for n in offered if n not in wanted],
+        "have other columns for": [n for n in shared if len(wanted[n]) != len(offered[n])],
+    }
     odd = {what: [n for n in names if n not in allow] for what, names in sides.items()}
     if said := [f"{what}: {shortened(names)}" for what, names in odd.items() if names]:
         told = "; they ".join(said)
@@ -93,15 +91,13 @@ def fit(motion: Motion, model: mujoco.MjModel, rate: float, allow: Sequence[str]
     if not rate > 0.0:
         raise UserError(f"rate is {rate}; it must be more than 0 [Hz].")
     tracks = poses(motion, model, allow)
-    size = float(np.ptp(kinematics(model, model.qpos0[None])[1][0, :, :3], axis=0).max())
+    size = size_of(model)
     for name, qpos in zip(motion.names, tracks, strict=True):
         high = np.abs(root_places(model, qpos)[:, 2]).max()
         fast = speeds(model, qpos, motion.rate).max()
-        if max(high, fast) > FARTHEST * max(size, 1e-3):
+        if max(high, fast) > FARTHEST * size:
             told = f"is {high:,.0f} m high or moves at {fast:,.0f} m/s, its body {size:.2g} m long"
-            raise UserError(
-                f"Clip {name!r} {told}: are these millimetres? Positions are in metres."
-            )
+            raise UserError(f"Clip {name!r} {told}: are these millimetres? Give metres.")
     tracks = [resample(model, qpos, motion.rate, rate) for qpos in tracks]
     return pack(model, tracks, motion.names, rate)
 
@@ -156,6 +152,13 @@ def kinematics(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[list[str], np.n
     own = np.flatnonzero(model.body_rootid == root_body(model))
     found = [np.hstack([data.xpos[own], data.xquat[own]]) for data in posed(model, qpos)]
     return [bare(model.body(i).name) for i in own], np.array(found)
+
+
+def size_of(model: mujoco.MjModel) -> float:
+    """Returns how long the body is in qpos0, more or less [m]."""
+    places = kinematics(model, model.qpos0[None])[1][0, :, :3]
+    own = model.body_rootid[model.geom_bodyid] == root_body(model)
+    return float(np.ptp(places, axis=0).max() + 2.0 * model.geom_rbound[own].max(initial=5e-4))
 
 
 def root_places(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:

@@ -53,7 +53,7 @@ def read(path: Path | str, rate: float = 0.0, frames: int = 0) -> Motion:
         broken = "cannot be read" if getattr(error, "errno", None) else "is cut short or broken"
         raise UserError(f"{path} {broken}: {reason(error)}.") from error
     _check_values(path, motion)
-    if not (motion.rate or rate):
+    if not (motion.rate or rate) > 0.0:
         raise UserError(f"{path} does not say its rate: give it, as rate=50 or --rate 50 [Hz].")
     if motion.rate and rate and motion.rate != rate:
         raise UserError(f"{path} is of {motion.rate:g} Hz, not {rate:g}: leave the rate out.")
@@ -173,10 +173,10 @@ def write(path: Path | str, clips: Clips, model: mujoco.MjModel) -> None:
         arrays |= {"position": qpos[..., i : i + 3], "quaternion": qpos[..., i + 3 : i + 7]}
         speeds = qvel[..., dofs[i] : dofs[i] + 6]
         arrays |= {"velocity": speeds[..., :3], "angular_velocity": speeds[..., 3:]}
-    parts = np.stack([body.kinematics(model, track)[1] for track in qpos])
+    posed = [body.kinematics(model, track) for track in qpos]
+    parts = np.stack([x for _, x in posed])
     arrays |= {"body_positions": parts[..., :3], "body_quaternions": parts[..., 3:]}
-    names = body.kinematics(model, qpos[0, :1])[0]
-    texts = {"joint_names": list(places), "body_names": names, "clip_names": clips.names}
+    texts = {"joint_names": places, "body_names": posed[0][0], "clip_names": clips.names}
     content = io.BytesIO()
     with h5py.File(content, "w") as file:
         for name, x in arrays.items():

@@ -48,7 +48,7 @@ def test_joints_that_only_one_has_are_named(model):
     assert not np.asarray(fitted.qpos[..., 8]).any() and np.asarray(fitted.qpos[..., 7]).any()
     with pytest.raises(UserError, match="lack joints of the body: root"):
         clips.fit(motion(values[..., 7:], bodies.JOINTS), model, 50.0)
-    with pytest.raises(UserError, match="not of: knee"):
+    with pytest.raises(UserError, match="have other columns for: knee"):
         clips.fit(motion(values, (*root, "knee", "knee")), model, 50.0, ("hip",))
 
 
@@ -121,7 +121,7 @@ def test_a_clip_of_one_frame_stands_still(model):
 
 
 def test_quaternions_that_are_none_are_refused_and_others_are_normalized(model):
-    with pytest.raises(UserError, match="'Walk_1': the quaternion of frame 3 is not of norm 1"):
+    with pytest.raises(UserError, match="'Walk_1', frame 3: a quaternion is not of norm 1"):
         clips.fit(motion(changed(3, 3, 0.5)), model, 50.0)
     fitted = clips.fit(motion(changed(3, 3, 0.005)), model, 50.0)
     assert abs(np.linalg.norm(fitted.qpos[1, 3, 3:7]) - 1) < 1e-6
@@ -140,6 +140,17 @@ def test_millimetres_are_refused(model):
         clips.fit(motion(still), model, 50.0)
     with pytest.raises(UserError, match="moves at 5,000 m/s"):
         clips.fit(motion(changed(3, 0, 100.0)), model, 50.0)
+
+
+def test_a_body_of_one_part_has_a_size():
+    ball = '<body><freejoint/><geom size="0.1"/></body>'
+    drone = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{ball}</worldbody></mujoco>")
+    values = np.tile(drone.qpos0, (1, 9, 1))
+    values[0, :, 2] = 0.2 * np.arange(9)  # 10 m/s
+    columns = ("root",) * 7
+    assert clips.fit(motion(values, columns), drone, 50.0).qpos.shape == (1, 9, 7)
+    with pytest.raises(UserError, match="its body 0.2 m long: are these millimetres"):
+        clips.fit(motion(values * [1, 1, 1e3, 1, 1, 1, 1], columns), drone, 50.0)
 
 
 def test_each_oddity_is_measured_and_placed(model):
