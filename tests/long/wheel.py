@@ -51,7 +51,7 @@ EXTRAS = {
         "export runs/cartpole_swingup/a --format jax --out p.jax",
     ],
     "clips": [
-        "import numpy as np; from purerl import clips, find, lookup; "
+        "import numpy as np; from purerl import clips, find; "
         "model = find('cartpole_swingup').build_env().physics.model; "
         "track = np.tile(model.qpos0, (9, 1)); "
         "clips.write('a.h5', clips.pack(model, [track], ['still'], 50.0), model)",
