@@ -51,6 +51,7 @@ from purerl.core.errors import StoppedError as StoppedError  # a run that was as
 
 # Rooms and modules that are useful alone.
 from purerl import adapters as adapters  # environments of Gymnasium, dm_env, brax, Playground
+from purerl import clips as clips  # recorded motion
 from purerl import eyes as eyes  # what a body sees, and networks that see
 from purerl import exact as exact  # programs of MJX with their sums in a fixed order
 from purerl.tune.plan import planner as planner  # behaviour by search, without learning

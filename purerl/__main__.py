@@ -12,7 +12,7 @@ from purerl.machine import command_errors, output
 
 COMMANDS = (
     "new", "check", "run", "evaluate", "render", "view", "record", "export", "pack", "compare",
-    "report", "plot", "sweep", "plan",
+    "report", "plot", "sweep", "plan", "clips",
 )  # fmt: skip
 
 HERE = Path(__file__).parent

@@ -16,7 +16,7 @@ import purerl
 from purerl import __main__ as commands
 
 ROOT = Path(__file__).parent.parent
-MODULES = {"adapters", "exact", "eyes", "lookup", "networks", "planner"}
+MODULES = {"adapters", "clips", "exact", "eyes", "lookup", "networks", "planner"}
 BESIDE = ("purerl.envs", "purerl.experiments")  # of this repository, as these files themselves
 NAMES = purerl.__all__
 # They measure the insides.
@@ -47,7 +47,7 @@ def test_each_name_of_the_stub_is_what_its_line_imports():
 
 def test_type_checkers_take_each_line_of_the_stub_for_public():
     """They do if a name is imported as itself."""
-    for package in (purerl, purerl.adapters, purerl.exact):
+    for package in (purerl, purerl.adapters, purerl.clips, purerl.exact):
         tree = ast.parse(Path(package.__file__).with_suffix(".pyi").read_text())
         lines = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
         names = {alias.name: alias.asname for line in lines for alias in line.names}

@@ -47,6 +47,7 @@ MAY_IMPORT = {
         "training",
     },
     "adapters": {"core", "ppo", "physics", "report"},
+    "clips": {"core", "physics", "machine", "experiment", "report"},
     "tune": {
         "core",
         "ppo",

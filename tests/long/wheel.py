@@ -50,6 +50,13 @@ EXTRAS = {
         "export runs/cartpole_swingup/a --format onnx --out p.onnx",
         "export runs/cartpole_swingup/a --format jax --out p.jax",
     ],
+    "clips": [
+        "import numpy as np; from purerl import clips, find; "
+        "model = find('cartpole_swingup').build_env().physics.model; "
+        "track = np.tile(model.qpos0, (9, 1)); "
+        "clips.write('a.h5', clips.pack(model, [track], ['still'], 50.0), model)",
+        "clips a.h5 --body cartpole_swingup",
+    ],
     "view": ["import purerl.tune.view.page, purerl.tune.view.scene"],
     "warp": ["import purerl; assert purerl.choose_engine('warp') == 'warp'"],
     "brax": [THEIRS.format("brax", "BraxOptions('inverted_pendulum')")],

@@ -1,0 +1,66 @@
+"""Motion of a person, as dm_control ships it, fitted to dm_control's humanoid."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("h5py", reason="pip install -e '.[clips]'")
+
+import h5py
+import mujoco
+from dm_control.locomotion import mocap
+from dm_control.locomotion.arenas import floors
+from dm_control.locomotion.walkers import cmu_humanoid
+
+from purerl import clips
+from purerl.clips import examine
+
+FILE = Path(mocap.__file__).parent / "test_trajectories.h5"
+
+
+def motion_of(walker) -> clips.Motion:
+    """Returns dm_control's two trajectories of 10 frames, [values, T] each dataset, as Motion."""
+    joints = tuple(joint.name for joint in walker.mocap_joints)
+    bodies = tuple(body.name for body in walker.mocap_tracking_bodies)
+    with h5py.File(FILE) as file:
+        names, values, places = tuple(file), [], []
+        for name in names:
+            person = file[name]["walkers/walker_0"]
+            values.append(
+                np.vstack([person[key] for key in ("position", "quaternion", "joints")]).T
+            )
+            places.append(person["body_positions"][()].T.reshape(10, -1, 3))
+        rate = 1.0 / float(file[names[0]].attrs["dt"])
+    columns = ("root",) * 7 + joints
+    lengths = np.full(len(names), 10)
+    return clips.Motion(columns, np.stack(values), lengths, names, rate, bodies, np.stack(places))
+
+
+@pytest.fixture(scope="module")
+def person():
+    """Returns MuJoCo's model of the humanoid on a floor, and motion of it."""
+    walker, arena = cmu_humanoid.CMUHumanoid(), floors.Floor()
+    walker.create_root_joints(arena.attach(walker))
+    xml, assets = arena.mjcf_model.to_xml_string(), arena.mjcf_model.get_assets()
+    return mujoco.MjModel.from_xml_string(xml, assets), motion_of(walker)
+
+
+def test_a_person_is_where_the_file_says(person):
+    model, motion = person
+    walk, roll = examine.examine(motion, model)
+    assert walk.startswith("cmuv2019_001: cmuv2019, 0.45 s, 10 frames at 20 Hz; 2.75 m/s")
+    assert "; 11.40 mm below the floor (rhumerus, frame 3); 0.82 deg beyond" in roll
+    for line in (walk, roll):
+        assert "; 0.00 mm from the file's positions (" in line
+    # Left for right is seen at once.
+    flip = [{"lfemurrx": "rfemurrx", "rfemurrx": "lfemurrx"}.get(n, n) for n in motion.columns]
+    wrong, _ = examine.examine(motion._replace(columns=tuple(flip)), model)
+    assert float(wrong.split(" mm from")[0].rpartition(" ")[2]) > 1.0
+
+
+def test_it_may_be_read_at_another_rate(person):
+    model, motion = person
+    fitted = clips.fit(motion, model, 100.0)
+    assert motion.rate == 20.0 and fitted.qpos.shape == (2, 46, 63)
+    np.testing.assert_allclose(fitted.qpos[:, ::5, 7:], motion.values[..., 7:], atol=1e-6)
