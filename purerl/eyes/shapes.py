@@ -153,10 +153,6 @@ def _normal_of_box(p: Array, length: Array) -> Array:
     return jnp.where(size == size.max(-1, keepdims=True), p, 0.0)
 
 
-def _normal_of_plane(p: Array, length: Array) -> Array:
-    return jnp.broadcast_to(UP, p.shape)
-
-
 def _normal_of_field(p: Array, heights: Array) -> Array:
     x, y = (0.5 * (n - 1) for n in heights.shape[::-1])
     _, slope_x, slope_y = _surface(heights, x * (p[..., 0] + 1.0), y * (p[..., 1] + 1.0))
@@ -165,7 +161,7 @@ def _normal_of_field(p: Array, heights: Array) -> Array:
 
 # In this order shapes stand in a scene. Boxes are last: those of an episode follow the model's.
 KINDS = {
-    _GEOM.mjGEOM_PLANE: Kind(np.ones_like, _enter_plane, _normal_of_plane),
+    _GEOM.mjGEOM_PLANE: Kind(np.ones_like, _enter_plane, lambda p, _: jnp.broadcast_to(UP, p.shape)),
     FIELD: Kind(lambda s: s, _enter_field, _normal_of_field),  # heights in place of a length
     _GEOM.mjGEOM_SPHERE: Kind(lambda s: s[[0, 0, 0]], _enter_ball, lambda p, _: p),
     _GEOM.mjGEOM_ELLIPSOID: Kind(lambda s: s, _enter_ball, lambda p, _: p),

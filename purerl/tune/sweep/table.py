@@ -114,10 +114,11 @@ def describe(rows: Sequence[Row], spaces: Sequence[Space], metric: str) -> list[
     lines = [f"{len(rows)} point{'s' * (len(rows) > 1)} ({told}), {metric} at the end"]
     lines += comparison.table(columns, records)
     lines += [f"{row.point.name} failed: {row.said}" for row in rows if row.status == "failed"]
-    found = [
-        x for row in rows if any((x := row.summary)[n] for n in ("done", "failed", "unfinished"))
-    ]
-    return lines + comparison.notes(found)
+    return lines + comparison.notes([row.summary for row in rows if _has_runs(row)])
+
+
+def _has_runs(row: Row) -> bool:
+    return any(row.summary[name] for name in ("done", "failed", "unfinished"))
 
 
 def _shown(text: str) -> str:
