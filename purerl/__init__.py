@@ -9,6 +9,7 @@ A name is imported when it is first used: `import purerl` does not start JAX.
 
 import ast
 import importlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,28 @@ def listed(file: str) -> dict[str, str]:
     nodes = ast.parse(Path(file).with_suffix(".pyi").read_bytes()).body
     lines = [node for node in nodes if isinstance(node, ast.ImportFrom)]
     return {alias.name: str(line.module) for line in lines for alias in line.names}
+
+
+def lazy(
+    package: str, file: str
+) -> tuple[dict[str, str], Callable[[str], Any], Callable[[], list[str]]]:
+    """Returns what makes a room import its public names when they are first used.
+
+    Args:
+      package: the room's name.
+      file: its `__init__.py`, which has a stub beside it.
+
+    Returns:
+      Its names with their modules, and the room's `__getattr__` and `__dir__`.
+    """
+    homes = listed(file)
+
+    def get(name: str) -> Any:
+        if name not in homes:
+            raise AttributeError(f"{package} has no {name!r}; it has {', '.join(sorted(homes))}.")
+        return getattr(importlib.import_module(homes[name]), name)
+
+    return homes, get, lambda: sorted(homes)
 
 
 HOMES = listed(__file__)

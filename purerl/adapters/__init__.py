@@ -10,12 +10,11 @@ May import: core, ppo, physics, report. Read: `stepping.py`, then the file of yo
 A name is imported when it is first used: each needs its library. docs/howto/adapters.md shows all.
 """
 
-import importlib
 from typing import Any
 
 import purerl
 
-HOMES = purerl.listed(__file__)
+HOMES, _get, __dir__ = purerl.lazy(__name__, __file__)
 # Library -> the extra that brings it.
 _EXTRAS = {"gymnasium": "gymnasium", "brax": "brax", "mujoco_playground": "playground"}
 __all__ = sorted(HOMES)
@@ -23,17 +22,11 @@ __all__ = sorted(HOMES)
 
 def __getattr__(name: str) -> Any:
     """Imports an adapter when it is first used."""
-    if name not in HOMES:
-        raise AttributeError(f"purerl.adapters has no {name!r}; it has {', '.join(__all__)}.")
     try:
-        return getattr(importlib.import_module(HOMES[name]), name)
+        return _get(name)
     except ModuleNotFoundError as error:
         extra = _EXTRAS.get((error.name or "").partition(".")[0])
         if extra is None:
             raise
         line = purerl.how_to_install(extra)
         raise ImportError(f"adapters.{name} needs {error.name}: {line}") from error
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -5,21 +5,7 @@ May import: core, physics, machine, experiment, report. Read: `records.py`, then
 calls. docs/howto/clips.md shows all of it.
 """
 
-import importlib
-from typing import Any
-
 import purerl
 
-HOMES = purerl.listed(__file__)
+HOMES, __getattr__, __dir__ = purerl.lazy(__name__, __file__)
 __all__ = sorted(HOMES)
-
-
-def __getattr__(name: str) -> Any:
-    """Imports a public name when it is first used."""
-    if name not in HOMES:
-        raise AttributeError(f"purerl.clips has no {name!r}; it has {', '.join(__all__)}.")
-    return getattr(importlib.import_module(HOMES[name]), name)
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -8,22 +8,8 @@ with equations replaced), then the two sets of rules: `order.py` with `scatters.
 and `fuse.py`, the optimisation. `portable.py` has the rules for a CPU. `xla_flags.py` stands alone.
 """
 
-import importlib
-from typing import Any
-
 import purerl
 
 # Imported when they are asked for: `set_xla_flags` has to be called before JAX starts.
-HOMES = purerl.listed(__file__)
+HOMES, __getattr__, __dir__ = purerl.lazy(__name__, __file__)
 __all__ = sorted(HOMES)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in HOMES:
-        raise AttributeError(f"purerl.exact has no {name!r}; it has {', '.join(__all__)}.")
-    return getattr(importlib.import_module(HOMES[name]), name)
-
-
-def __dir__() -> list[str]:
-    """Lists the public names."""
-    return __all__

@@ -161,7 +161,9 @@ def _normal_of_field(p: Array, heights: Array) -> Array:
 
 # In this order shapes stand in a scene. Boxes are last: those of an episode follow the model's.
 KINDS = {
-    _GEOM.mjGEOM_PLANE: Kind(np.ones_like, _enter_plane, lambda p, _: jnp.broadcast_to(UP, p.shape)),
+    _GEOM.mjGEOM_PLANE: Kind(
+        np.ones_like, _enter_plane, lambda p, _: jnp.broadcast_to(UP, p.shape)
+    ),
     FIELD: Kind(lambda s: s, _enter_field, _normal_of_field),  # heights in place of a length
     _GEOM.mjGEOM_SPHERE: Kind(lambda s: s[[0, 0, 0]], _enter_ball, lambda p, _: p),
     _GEOM.mjGEOM_ELLIPSOID: Kind(lambda s: s, _enter_ball, lambda p, _: p),
