@@ -26,7 +26,7 @@ from tests.test_rooms import MODULES, own
 
 ROOT = Path(__file__).parent.parent.parent
 TOY = Path(__file__).parent.parent / "runs" / "toy_experiment.py"
-COMPUTING = ["adapters", "core", "devices", "exact", "eyes", "physics", "ppo"]  # rooms
+COMPUTING = ["adapters", "clips", "core", "devices", "exact", "eyes", "physics", "ppo"]  # rooms
 AN_EDIT = "\nEDITED = True\n"
 # What moves no bit.
 COMMENT = '\n# A comment.\n"""A text, where a docstring stands."""\n'
