@@ -208,7 +208,7 @@ def test_a_library_that_is_not_there_is_one_line(name, monkeypatch):
         package = library.get(name, "gymnasium.vector")
         raise ModuleNotFoundError(f"No module named {package!r}", name=package)
 
-    monkeypatch.setattr(adapters.importlib, "import_module", missing)
+    monkeypatch.setattr(importlib, "import_module", missing)
     extra = {"from_brax": "brax", "from_playground": "playground"}.get(name, "gymnasium")
     with pytest.raises(ImportError, match=rf"adapters.{name} needs .*'.\[{extra}\]'"):
         getattr(adapters, name)
