@@ -6,7 +6,7 @@ drawn by `reset`, so that every environment has its own and a checkpoint holds t
 """
 
 import dataclasses
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -315,6 +315,8 @@ def randomized_fields(model: Any, factors: dict[str, Array]) -> dict[str, Array]
 
 def build_arena(options: Options, body: Body) -> Arena:
     """Returns the arena, its window of boxes as small as the body's reach allows."""
+    if options.arena not in (arenas := get_args(get_type_hints(Options)["arena"])):
+        raise ValueError(f"arena is {options.arena!r}; there are {', '.join(arenas)}.")
     if options.arena == "floor":
         return Floor()
     platform_length = options.platform_length

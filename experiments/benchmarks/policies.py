@@ -11,7 +11,6 @@ notes about its own folder is dropped. The second writes the table of these poli
 """
 
 import argparse
-import contextlib
 import getpass
 import itertools
 import json
@@ -42,8 +41,9 @@ HEAD = (
 )
 TABLE = re.compile(re.escape(HEAD) + r"(?:\|.*\n)*")
 # A folder's name from the root on. What stands before it in a text is no part of a word.
-# The first of two letters at least: arrays have shorter ones by chance.
-ABSOLUTE = re.compile(rb"(?:^|[\s\"'=:(\[])(/\w[\w.+-]+/(?:\w[\w.+-]*/)*)")
+ABSOLUTE = re.compile(rb"(?:^|[\s\"'=:(\[])(/(?:\w[\w.+-]*/)+)")
+# In files of arrays the names of leaves look like one, and so do bytes by chance.
+AT_HOME = re.compile(rb"/(?:home|root|tmp|usr|opt|var|mnt|srv|scratch)/\w+")
 
 
 # --- the folder ---
@@ -92,10 +92,11 @@ def tells_of_machine(folder: Path) -> Iterator[str]:
     words = re.compile(rb"\b(" + b"|".join(re.escape(x.encode()) for x in people if x) + rb")\b")
     for file in sorted(file for file in folder.rglob("*") if file.is_file()):
         content = file.read_bytes()
-        found = ABSOLUTE.findall(content)
-        with contextlib.suppress(UnicodeDecodeError):  # a short name is in compressed arrays, too
+        try:
             content.decode()
-            found += filter(None, words.findall(content))
+            found = ABSOLUTE.findall(content) + [x for x in words.findall(content) if x]
+        except UnicodeDecodeError:
+            found = AT_HOME.findall(content)
         for what in found[:1]:
             yield f"{file.relative_to(folder)}: {what.decode(errors='replace')}"
 

@@ -105,7 +105,16 @@ def fit(motion: Motion, model: mujoco.MjModel, rate: float, allow: Sequence[str]
 def pack(
     model: mujoco.MjModel, tracks: Sequence[np.ndarray], names: Sequence[str], rate: float
 ) -> Clips:
-    """Puts tracks, qpos [L, nq] each at `rate` [Hz], into Clips, with their velocities."""
+    """Puts tracks, qpos [L, nq] each at `rate` [Hz], into Clips, with their velocities.
+
+    Raises:
+      UserError: there is not one name for each track, or two are the same.
+    """
+    if len(set(names)) != len(tracks) or len(names) != len(tracks):
+        many = f"{len(tracks)} tracks have {len(names)} names, {len(set(names))} of them different"
+        raise UserError(f"{many}: give each track one of its own.")
+    if wrong := [f"{x.shape}" for x in tracks if x.shape[1:] != (model.nq,)]:
+        raise UserError(f"A track is of shape {wrong[0]}; it must be [L, {model.nq}] of this body.")
     lengths = np.array([len(qpos) for qpos in tracks], np.int32)
     padding = [((0, lengths.max() - length), (0, 0)) for length in lengths]
     qpos = [np.pad(x, more, "edge") for x, more in zip(tracks, padding, strict=True)]

@@ -89,6 +89,8 @@ def _read_named(path: Path, file: Any) -> Motion:
     columns = get("metadata/joint_names", 1, width)
     if "all_clips/position" in file or "all_clips/quaternion" in file:
         root = [get(f"all_clips/{name}", 3, clips) for name in ("position", "quaternion")]
+        if (widths := [x.shape[-1] for x in root]) != [3, 4]:
+            raise UserError(f"{path}: position and quaternion have {widths} columns, not [3, 4].")
         columns, values = (body.ROOT,) * 7 + columns, np.concatenate([*root, values], -1)
     names = get("metadata/clip_names", 1, clips[:1], _numbered(clips[0]))
     lengths = get("metadata/clip_lengths", 1, clips[:1], np.full(*clips))

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from purerl.core.errors import UserError, reason
+from purerl.experiment import loading
 from purerl.machine import files, lock
 from purerl.runs import checkpoint_folder
 from purerl.runs.manifest import fingerprint
@@ -152,7 +153,10 @@ def check_is_run(path: Path) -> None:
     if found != [path]:
         runs = f" Runs found: {', '.join(map(str, found))}." if found else ""
         what = f"no run: it has no {CONFIG}" if path.is_dir() else "no folder"
-        raise UserError(f"{path} is {what}.{runs}")
+        known = sorted(place.name for place in loading.POLICIES.glob("*"))
+        played = f" Policies that come with purerl: {', '.join(known)}."
+        lone = played if not path.is_dir() and path.parent == Path() else ""
+        raise UserError(f"{path} is {what}.{runs}{lone}")
 
 
 def runs_in(place: Path) -> list[Path]:

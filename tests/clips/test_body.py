@@ -182,3 +182,20 @@ def test_what_could_not_be_compared_is_unknown():
     _, line = examine.examine(motion(), mujoco.MjModel.from_xml_string(bare))
     assert "unknown mm below the floor; 0.00 deg" in line
     assert line.endswith("unknown mm from the file's positions")
+
+
+@pytest.mark.parametrize(
+    ("shapes", "names", "says"),
+    [
+        ([2, 2], ["a"], "2 tracks have 1 names, 1 of them different"),
+        ([2, 2], ["a", "a"], "2 tracks have 2 names, 1 of them different"),
+        ([2, 1], ["a", "b"], r"A track is of shape \(5, 1\); it must be \[L, 2\]"),
+    ],
+)
+def test_tracks_have_names_and_the_bodys_columns(shapes, names, says):
+    joints = "".join(f"<joint name='j{i}'/>" for i in range(2))
+    body_of_two = f"<body>{joints}<geom size='.1'/></body>"
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body_of_two}</worldbody></mujoco>")
+    tracks = [np.zeros((5, n)) for n in shapes]
+    with pytest.raises(UserError, match=says):
+        clips.pack(model, tracks, names, 50.0)

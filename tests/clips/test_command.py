@@ -40,6 +40,7 @@ def test_they_are_checked_cut_and_drawn_with_one(file, capsys, tmp_path, monkeyp
     assert first.startswith("Roll_1: Roll, 1.00 s, 51 frames at 50 Hz; 0.00 m/s; unknown mm below")
     words = ["--cut", "Roll_1", "0.2", "0.6", "-o", "part.h5", "--draw", "Hang_2"]
     assert command.main([str(file), *BODY, *words]) == 0
+    assert command.main([str(file), *BODY, *words]) == 2, "part.h5 is there"
     part = clips.read("part.h5")
     assert part.names == ("Roll_1",) and part.lengths.tolist() == [21]
     np.testing.assert_allclose(part.values[0, :, 0], 2.0 * np.arange(10, 31) / 50, atol=1e-6)
