@@ -128,8 +128,8 @@ class Escape:
             observation: Any = jnp.concatenate([*parts, told])
         else:
             heights = bowls.heights(self.bowl, task["terrain"])
-            sharp = self.eyes.see(readings.xpos, readings.xmat, heights=heights)
-            pictures = sight.spoil(sharp, task["eyes"], physics.time, self.options.eyes)
+            given = readings, task["eyes"], physics.time, self.options.eyes
+            pictures = sight.look(self.eyes, *given, heights=heights)
             observation = {"policy": jnp.concatenate(parts), "eyes": pictures, "privileged": told}
         escaped = (distance > self.bowl.half).astype(jnp.float32)
         metrics = {"distance": distance, "up": up, "escaped": escaped}

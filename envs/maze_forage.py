@@ -117,8 +117,8 @@ class Forage:
             observation: Any = jnp.concatenate([*parts, told])
         else:
             walls = mazes.all_walls(self.maze, task["free"])
-            sharp = self.eyes.see(readings.xpos, readings.xmat, walls)
-            pictures = sight.spoil(sharp, task["eyes"], physics.time, self.options.eyes)
+            given = readings, task["eyes"], physics.time, self.options.eyes
+            pictures = sight.look(self.eyes, *given, boxes=walls)
             observation = {"policy": jnp.concatenate(parts), "eyes": pictures, "privileged": told}
         number = new.sum(dtype=jnp.float32)
         ahead = readings.xmat[torso, :, 0] @ physics.qvel[:3]

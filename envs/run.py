@@ -247,8 +247,8 @@ class Run:
         boxes = None
         if "course" in task:
             boxes = platform_boxes(task["course"], self.options.corridor_width)
-        sharp = self.eyes.see(readings.xpos, readings.xmat, boxes)
-        return sight.spoil(sharp, task["eyes"], physics.time, self.options.eyes)
+        given = readings, task["eyes"], physics.time, self.options.eyes
+        return sight.look(self.eyes, *given, boxes=boxes)
 
 
 def is_healthy(body: Body, options: Options, height: Array, up: Array, turn: Array) -> Array:

@@ -73,6 +73,21 @@ def draw(key: Array, options: Sight) -> dict[str, Array]:
     return {"open": ~closed} | ({"noise_key": noise_key} if options.noise else {})
 
 
+def look(
+    seer: eyes.Eyes,
+    readings: Any,
+    drawn: dict[str, Array],
+    time: Array,
+    options: Sight,
+    **scene: Any,
+) -> Array:
+    """Returns what the eyes bring on now, [E, H, W] uint8: see `spoil`.
+
+    `readings` have `xpos` and `xmat`; `scene` is what of this episode `Eyes.see` takes.
+    """
+    return spoil(seer.see(readings.xpos, readings.xmat, **scene), drawn, time, options)
+
+
 def spoil(pictures: Array, drawn: dict[str, Array], time: Array, options: Sight) -> Array:
     """Returns pictures [E, H, W] uint8 as these eyes bring them on: blurred, noisy, or black.
 

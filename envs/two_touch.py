@@ -97,8 +97,8 @@ class TwoTouch:
         if self.eyes is None:
             observation: Any = jnp.concatenate([*parts, where])
         else:
-            sharp = self.eyes.see(readings.xpos, readings.xmat)
-            pictures = sight.spoil(sharp, task["eyes"], physics.time, self.options.eyes)
+            given = readings, task["eyes"], physics.time, self.options.eyes
+            pictures = sight.look(self.eyes, *given)
             since = physics.time - jnp.maximum(task["orb"]["first"], 0.0)
             told = jnp.append(where, jnp.where(logic == ONCE, since, 0.0))
             observation = {"policy": jnp.concatenate(parts), "eyes": pictures, "privileged": told}

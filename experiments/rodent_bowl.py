@@ -2,7 +2,7 @@
 
 python -m purerl.run rodent_bowl
 
-Expected: after 3 M steps, 17 min on four CPU cores, it gets up from any fall and is 1.2 m from the
+Expected: after 3 M steps, 17 min on four CPU cores, it gets up after the fall and is 1.2 m from the
 middle on average: 195 of 1000 (one seed), and rising. Out of the bowl are 6 m: not trained so far.
 """
 

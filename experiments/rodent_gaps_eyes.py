@@ -17,11 +17,5 @@ experiment = dataclasses.replace(
     told,
     env=dataclasses.replace(told.env, eyes=sight.Sight(number=2)),
     build_network=eyes.mlp,
-    network=eyes.MlpOptions(
-        policy_hidden=(256, 256),
-        value_hidden=(256, 256),
-        std="state",
-        initial_std=0.3,
-        min_std=1e-3,
-    ),
+    network=eyes.MlpOptions(**vars(told.network)),
 )
