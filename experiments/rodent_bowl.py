@@ -2,8 +2,9 @@
 
 python -m purerl.run rodent_bowl
 
-Expected: after 3 M steps, 17 min on four CPU cores, it gets up after the fall and is 1.2 m from the
-middle on average: 195 of 1000 (one seed), and rising. Out of the bowl are 6 m: not trained so far.
+Expected: it gets up after the fall and climbs. After 8 M steps, 16 min on twelve CPU cores, its
+head is 3 m from the middle on average and 434 of 1000 are earned (one seed), rising; out of the
+bowl are 6 m, where it is 4% of the time.
 """
 
 import dataclasses
