@@ -7,8 +7,9 @@ import io
 import re
 import shlex
 import sys
+import types
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, get_args, get_origin
 
 import tyro
 
@@ -22,6 +23,7 @@ from purerl.machine import command_errors, output
 CONFIG = (tyro.conf.FlagCreatePairsOff,)
 # A flag takes a word, True or False, as every other option does.
 WORDS = (tyro.conf.FlagConversionOff,)
+RULES = tyro.constructors.ConstructorRegistry()
 # Gives back an experiment with the overrides of a command line, and the command's options.
 Over = Callable[..., tuple[Experiment, Any]]
 
@@ -183,15 +185,39 @@ def parse(
     extra = {} if base is None else {"default": base}
     try:
         with output.answering(), contextlib.redirect_stderr(said):
-            return tyro.cli(kind, args=list(words), prog=prog, config=config, **extra, **more)
+            given = {"args": list(words), "prog": prog, "config": config, "registry": RULES}
+            return tyro.cli(kind, **given, **extra, **more)
     except SystemExit as error:
         if not error.code:
             raise
-        what = _one_line(said.getvalue(), _option_names(kind, base))
+        what = _one_line(said.getvalue(), _option_names(kind, base), base)
         raise UserError(f"{what} All options: {prog} --help") from error
 
 
-def _one_line(text: str, names: list[str]) -> str:
+@RULES.struct_rule
+def _either(info: Any) -> tyro.constructors.StructConstructorSpec | None:
+    """Lets an entry of a dict be of either annotated kind: tyro would take that of its default."""
+    inner = get_args(info.type)
+    if get_origin(info.type) is not dict or not isinstance(inner[1], types.UnionType):
+        return None
+    entry, default = tyro.constructors.StructFieldSpec, info.default
+    given = default.items() if isinstance(default, dict) else ()
+    fields = tuple(entry(name, inner[1], value) for name, value in given)
+    return tyro.constructors.StructConstructorSpec(dict, fields) if fields else None
+
+
+def _entries(option: str, value: Any) -> str:
+    """Returns which entries a dict of the settings `value` has, where an option names another."""
+    path = option[2:].replace("-", "_").split(".")
+    for i, word in enumerate(path):
+        if isinstance(value, dict) and word not in value:
+            names = ", ".join(value) or "none"
+            return f"{'.'.join(path[:i])} names {names}: name others in the experiment's file."
+        value = value[word] if isinstance(value, dict) else getattr(value, word, None)
+    return ""
+
+
+def _one_line(text: str, names: list[str], base: Any) -> str:
     """Returns tyro's framed, coloured message as one line: what is wrong, and the nearest fix."""
     text = re.sub(r"\x1b\[[0-9;]*m", "", text)
     plain = " ".join(re.sub(r"[─-╿]|-{5,}", " ", text).split())
@@ -204,7 +230,7 @@ def _one_line(text: str, names: list[str]) -> str:
             return f"{unknown[1]} takes no value; --{group}{dot}no-{name} turns it off."
         if not unknown[1].startswith("-"):
             return f"{unknown[1]!r} follows no option; write one before it, as in --name x."
-        hint = other_trainers.suggest(unknown[1], names)
+        hint = _entries(unknown[1], base) or other_trainers.suggest(unknown[1], names)
         return f"There is no option {unknown[1]}. {hint}".strip()
     titles = "Value error|Missing argument|Invalid choice|Parsing error|Required options"
     plain = re.sub(rf"^({titles}) ", "", plain)
@@ -229,6 +255,11 @@ _IN_WORDS: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
         r"^Error parsing (\S+): Could not find valid parse for arguments: \[(.*)\]",
         r"\1 is \2; write numbers with spaces between them, such as 64 64",
     ),
+    (
+        r"^Error parsing (\S+): no type matching (.+?) could be instantiated from \[(.*?)\].*",
+        r"\1 is \3; it must be \2",
+    ),
+    (r"\|\{([A-Z ]+)\}", r" or \1"),  # FLOAT|{FLOAT FLOAT INT}
     (r"^invalid choice (.*) for argument '(\S+)'.*\((.*)\)", _wrong_choice),
     (r"^Missing from .*?: [A-Z.,\[\]{} ]+?(?=[A-Z][a-z'])", "The command lacks: "),
     (r" \(required\)", ""),

@@ -22,6 +22,8 @@ from purerl.machine import array_files, files
 from purerl.machine.state_arrays import Leaves, digest_leaves, leaf_paths, raw, unflatten
 from purerl.runs import checkpoint_folder, manifest
 
+BEGUN = "Use the settings and the version of purerl that the run began with."
+
 
 class Saved(NamedTuple):
     """One checkpoint read back, every hash checked."""
@@ -81,11 +83,16 @@ def load_checkpoint(path: Path, abstract: PyTree, owners: Sequence[manifest.Owne
     return Saved(unflatten(leaves, abstract), meta)
 
 
-def load_leaves(path: Path, like: PyTree, owners: Any, ask: Callable = bool) -> tuple[Leaves, Any]:
-    """Reads the leaves to whose paths `ask` says yes (`bool`: to all); it raises what that does."""
+def load_leaves(
+    path: Path, like: PyTree, owners: Any, ask: Callable = bool, cure: str = BEGUN
+) -> tuple[Leaves, Any]:
+    """Reads the leaves to whose paths `ask` says yes (`bool`: to all); it raises what that does.
+
+    `cure` is what its error says of leaves of other shapes.
+    """
     meta = checkpoint_folder.load_meta(path)
     manifest.check_owner(path, meta, owners)
-    wanted = _check_fits(path, meta, like, ask)
+    wanted = _check_fits(path, meta, like, ask, cure)
     checkpoint_folder.check_files(path, meta)
     leaves = {key: np.zeros(shape, np.dtype(dtype)) for key, (dtype, shape) in wanted.items()}
     try:
@@ -169,7 +176,9 @@ def _compare(leaves: Leaves, expected: dict[str, Any]) -> None:
             raise ValueError(f"leaf {key} comes back otherwise (sha256 differs)")
 
 
-def _check_fits(path: Path, meta: Any, abstract: PyTree, ask: Callable) -> dict[str, tuple]:
+def _check_fits(
+    path: Path, meta: Any, abstract: PyTree, ask: Callable, cure: str = BEGUN
+) -> dict[str, tuple]:
     """Returns each leaf's dtype and shape; UserError if those that were saved are others."""
     shapes = [(str(x.dtype), list(x.shape)) for x in jax.tree.leaves(jax.eval_shape(raw, abstract))]
     wanted = {k: x for k, x in zip(leaf_paths(abstract), shapes, strict=True) if ask(k)}
@@ -183,7 +192,7 @@ def _check_fits(path: Path, meta: Any, abstract: PyTree, ask: Callable) -> dict[
             raise UserError(
                 f"The checkpoint {path} is of another state: leaf {key} is "
                 f"{_shown(stored.get(key))} in it and {_shown(wanted.get(key))} in this "
-                "experiment. Use the settings and the version of purerl that the run began with."
+                f"experiment. {cure}"
             )
     return wanted
 

@@ -13,6 +13,7 @@ import numpy as np
 from purerl.core.errors import UserError, unknown_name
 from purerl.core.records import Array, PyTree
 from purerl.experiment.definition import Part
+from purerl.experiment.loading import shipped
 from purerl.experiment.network_parts import belongs, is_held, map_named, top_names
 from purerl.machine.state_arrays import Leaves, digest_leaves
 from purerl.runs import checkpoint, checkpoint_folder, manifest
@@ -42,7 +43,7 @@ def read_parts(parts: Mapping[str, Part], abstract: PyTree) -> tuple[Leaves, dic
 
 def _read(name: str, part: Part, abstract: PyTree) -> tuple[Leaves, dict[str, Any]]:
     """Returns one part's arrays, and the statistics that it reads by; and whose they are."""
-    run = read_run(Path(part.run))
+    run = read_run(shipped(part.run) or Path(part.run))
     path, owners = find_checkpoint(run, part.checkpoint), manifest.owners(check_manifest(run))
 
     def asked(key: str) -> bool:
@@ -55,7 +56,8 @@ def _read(name: str, part: Part, abstract: PyTree) -> tuple[Leaves, dict[str, An
         there = [key.removeprefix("params/") for key in stored if key.startswith("params/")]
         if not any(belongs(key, name) for key in there):
             raise UserError(unknown_name("part", name, top_names(there), f" in {run.path}"))
-        leaves, meta = checkpoint.load_leaves(path, abstract, owners, asked)
+        cure = f"The part {name} begins as it is there: give it, and what it reads, those sizes."
+        leaves, meta = checkpoint.load_leaves(path, abstract, owners, asked, cure)
     except checkpoint_folder.DamagedError as error:
         raise UserError(f"The checkpoint {path} is damaged: {error}.") from error
     facts = {"run": run.manifest["run_id"], "update": meta["update"]}
