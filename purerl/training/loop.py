@@ -243,7 +243,9 @@ def _why_lost(programs: Programs, state: Any, records: Sequence[Record], seed: i
             "No step of an update was sound: of each, some number of the state is NaN or absurd, "
             f"which `purerl.check_env(env)` names. {part}"
         ).strip()
-    skips = f"The last {skipped:.0f} minibatches had a non-finite loss or gradient and were skipped."
+    skips = (
+        f"The last {skipped:.0f} minibatches had a non-finite loss or gradient and were skipped."
+    )
     bad = [name for name, x in losses.items() if not np.isfinite(x).all()]
     if bad and not part:
         return f"{skips} The network's loss {', '.join(bad)} is not finite: mend it there."
