@@ -9,6 +9,7 @@ import numpy as np
 from purerl.physics import lookup
 
 Vector = tuple[float, float, float]
+NARROW = 5.0  # degrees: no eye sees less, and no angle in radians is as much
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,8 +29,8 @@ class Eye:
 
     def __post_init__(self) -> None:
         """Refuses what sees nothing."""
-        if not 0.0 < self.fovy < 180.0:
-            raise ValueError(f"fovy is {self.fovy}; give degrees, more than 0 and less than 180.")
+        if not NARROW <= self.fovy < 180.0:
+            raise ValueError(f"fovy is {self.fovy}; give degrees, {NARROW:g} to less than 180.")
         for name in ("position", "direction", "up"):
             if np.shape(given := getattr(self, name)) != (3,) or not np.isfinite(given).all():
                 raise ValueError(f"{name} is {given}; give three finite numbers.")
