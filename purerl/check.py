@@ -39,8 +39,8 @@ def command(words: Sequence[str]) -> int:
     train.set_xla_flags_in_time()
     source, chosen, given = read_experiment(words, "python -m purerl.check", CheckOptions)
     compilation.set_up_jax(given.cache)
-    about = f"{source.name}: {summary(source.path)}".rstrip(": ")
-    output.show(about, "Building and compiling first: for a large body that may take two minutes.")
+    output.show(f"{source.name}: {summary(source.path)}")
+    output.show("Building and compiling first: for a large body that may take two minutes.")
     levels: list[str] = []
     with program_errors():
         for finding in examine(chosen, given.speed):

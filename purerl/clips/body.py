@@ -91,36 +91,29 @@ def fit(motion: Motion, model: mujoco.MjModel, rate: float, allow: Sequence[str]
     """
     check_rate(rate)
     tracks = poses(motion, model, allow)
-    size = size_of(model)
     for clip, qpos in enumerate(tracks):
-        if told := _other_units(motion, clip, model, qpos, size):
-            raise UserError(f"Clip {motion.names[clip]!r} {told}.")
+        if told := _other_units(motion, clip, model, qpos):
+            raise UserError(f"Clip {motion.names[clip]!r} {told}")
     tracks = [resample(model, qpos, motion.rate, rate) for qpos in tracks]
     return pack(model, tracks, motion.names, rate)
 
 
-def _other_units(
-    motion: Motion, clip: int, model: mujoco.MjModel, qpos: np.ndarray, size: float
-) -> str:
-    """Returns in which other units a track [L, nq] must be of a body `size` [m] long, or ""."""
-    high = np.abs(root_places(model, qpos)[:, 2]).max()
-    fast = speeds(model, qpos, motion.rate).max()
-    if max(high, fast) > FARTHEST * size:
+def _other_units(motion: Motion, clip: int, model: mujoco.MjModel, qpos: np.ndarray) -> str:
+    """Returns in which other units a track [L, nq] must be, and by what that shows; else ""."""
+    size, high = size_of(model), np.abs(root_places(model, qpos)[:, 2]).max()
+    if max(high, fast := speeds(model, qpos, motion.rate).max()) > FARTHEST * size:
         told = f"is {high:,.0f} m high or moves at {fast:,.0f} m/s, its body {size:.2g} m long"
-        return f"{told}: are these millimetres? Give metres"
+        return f"{told}: are these millimetres? Give metres."
     beyond, names = beyond_ranges(model, qpos)
     if names and np.median(beyond.max(axis=1)) > 180.0:
-        far = names[beyond.max(axis=0).argmax()]
-        told = f"has {far} {beyond.max():,.0f} deg beyond its range, and most frames are like that"
-        return f"{told}: are these degrees? Give radians"
-    if root := joint_places(model).get(ROOT):
-        rolled = qpos[:FEW].copy()
-        rolled[:, root[3:]] = np.roll(rolled[:, root[3:]], 1, axis=1)
-        tried = (from_positions(motion, clip, model, x)[0] for x in (qpos[:FEW], rolled))
-        now, then = (x.mean() if x.size else 0.0 for x in tried)
-        if now > max(1.0, 10.0 * then):
-            told = f"is {now:,.1f} mm from the file's positions, and {then:,.1f} with w read last"
-            return f"{told}: give quaternions with w first"
+        told = f"has {names[beyond.max(axis=0).argmax()]} {beyond.max():,.0f} deg beyond its range"
+        return f"{told}, and most frames are like that: are these degrees? Give radians."
+    rolled, turn = qpos[:FEW].copy(), joint_places(model).get(ROOT, [])[3:]
+    rolled[:, turn] = np.roll(rolled[:, turn], 1, axis=1)
+    now, then = (from_positions(motion, clip, model, x)[0] for x in (qpos[:FEW], rolled))
+    if now.size and now.mean() > max(1.0, 10.0 * then.mean()):
+        told = f"is {now.mean():,.1f} mm from the file's positions, and {then.mean():,.1f} if w is"
+        return f"{told} last in its quaternions: give it first."
     return ""
 
 

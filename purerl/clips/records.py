@@ -11,8 +11,6 @@ import numpy as np
 from purerl.core.errors import UserError, unknown_name
 from purerl.core.records import Array
 
-SLOWEST = 2.0  # [Hz] at which anything is recorded
-
 
 class Motion(NamedTuple):
     """What a file holds, in its own words: C clips of at most T frames, fitted to no body yet."""
@@ -57,9 +55,8 @@ def shortened(names: Iterable[str], most: int = 8) -> str:
 
 def check_rate(rate: float) -> None:
     """Raises UserError for what is no rate [Hz], but perhaps the seconds from a frame to a next."""
-    if not SLOWEST <= rate < np.inf:
-        what = f"it must be frames a second [Hz], {SLOWEST:g} or more"
-        raise UserError(f"rate is {rate:g}; {what}: 0.02 s from one to the next are 50 Hz.")
+    if not 2.0 <= rate < np.inf:  # nothing is recorded more slowly
+        raise UserError(f"rate is {rate:g}; give frames a second, 2 Hz or more: 0.02 s are 50 Hz.")
 
 
 def choose(clips: Clips, *names: str) -> Clips:

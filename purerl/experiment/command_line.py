@@ -7,9 +7,8 @@ import io
 import re
 import shlex
 import sys
-import types
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, get_args, get_origin
+from typing import Any, get_args
 
 import tyro
 
@@ -182,11 +181,10 @@ def parse(
       UserError: there is no such option (the message has the nearest one), or a value is wrong.
     """
     said = io.StringIO()
-    extra = {} if base is None else {"default": base}
+    extra = {"registry": RULES} | ({} if base is None else {"default": base})
     try:
         with output.answering(), contextlib.redirect_stderr(said):
-            given = {"args": list(words), "prog": prog, "config": config, "registry": RULES}
-            return tyro.cli(kind, **given, **extra, **more)
+            return tyro.cli(kind, args=list(words), prog=prog, config=config, **extra, **more)
     except SystemExit as error:
         if not error.code:
             raise
@@ -195,15 +193,14 @@ def parse(
 
 
 @RULES.struct_rule
-def _either(info: Any) -> tyro.constructors.StructConstructorSpec | None:
-    """Lets an entry of a dict be of either annotated kind: tyro would take that of its default."""
-    inner = get_args(info.type)
-    if get_origin(info.type) is not dict or not isinstance(inner[1], types.UnionType):
+def _of_annotated_kind(info: Any) -> Any:
+    """Lets an entry of a dict be of each annotated kind: tyro takes that of its default alone."""
+    kinds, default = get_args(info.type), info.default
+    if not (isinstance(default, dict) and default and get_args(kinds and kinds[-1])):
         return None
-    entry, default = tyro.constructors.StructFieldSpec, info.default
-    given = default.items() if isinstance(default, dict) else ()
-    fields = tuple(entry(name, inner[1], value) for name, value in given)
-    return tyro.constructors.StructConstructorSpec(dict, fields) if fields else None
+    field = tyro.constructors.StructFieldSpec
+    fields = tuple(field(name, kinds[-1], value) for name, value in default.items())
+    return tyro.constructors.StructConstructorSpec(dict, fields)
 
 
 def _entries(option: str, value: Any) -> str:
@@ -211,8 +208,8 @@ def _entries(option: str, value: Any) -> str:
     path = option[2:].replace("-", "_").split(".")
     for i, word in enumerate(path):
         if isinstance(value, dict) and word not in value:
-            names = ", ".join(value) or "none"
-            return f"{'.'.join(path[:i])} names {names}: name others in the experiment's file."
+            names = f"{'.'.join(path[:i])} names {', '.join(value) or 'none'}"
+            return f"{names}: name others in the experiment's file."
         value = value[word] if isinstance(value, dict) else getattr(value, word, None)
     return ""
 
@@ -256,7 +253,7 @@ _IN_WORDS: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
         r"\1 is \2; write numbers with spaces between them, such as 64 64",
     ),
     (
-        r"^Error parsing (\S+): no type matching (.+?) could be instantiated from \[(.*?)\].*",
+        r"^Error parsing (\S+): no type matching (.+?) could.*?\[(.*?)\].*",
         r"\1 is \3; it must be \2",
     ),
     (r"\|\{([A-Z ]+)\}", r" or \1"),  # FLOAT|{FLOAT FLOAT INT}

@@ -197,25 +197,20 @@ def _check_network(network: Network, observation: PyTree, action_size: int) -> t
 
 def _taken(network: Network, carry: PyTree) -> list[str]:
     """Returns what `apply` is called with; UserError unless it takes noise just if it is drawn."""
-    given, noise = ["params", "observation", "memory"], ["noise"] * (network.draw is not None)
+    noise = ["noise"] * (network.draw is not None)
+    given = ["params", "observation", "memory", *noise]
     name, function, taken = "network.apply", network.apply, given
-    if getattr(function, "__module__", "") == networks.__name__:  # of a module, which says more
+    if getattr(function, "__module__", "") == networks.__name__:  # the module says more
         module = inspect.getclosurevars(function).nonlocals["module"]
         name, function = type(module).__name__, module.__call__
-        taken = given[1 : 3 if jax.tree.leaves(carry) else 2]
-    try:
-        check_takes(name, function, *taken, *noise)
-    except UserError as error:
-        cure = " What Network.draw draws comes last: take it, as noise=None, or leave draw out"
-        raise UserError(f"{error}{f'{cure} ({PARTS}).' * len(noise)}") from error
+        taken = ["observation", *["memory"] * bool(jax.tree.leaves(carry)), *noise]
+    cure = f" Let it take what Network.draw draws, as noise=None, or leave draw out ({PARTS})."
+    check_takes(name, function, *taken, cure=cure * len(noise))
     more = list(inspect.signature(function).parameters.values())[len(taken) :]
     if not noise and more and more[0].default is None and more[0].kind < more[0].KEYWORD_ONLY:
-        raise UserError(
-            f"{name} takes {more[0].name}, which is None without a Network.draw: give one, such as "
-            f"network._replace(draw=lambda key: jax.random.normal(key, (2,))) ({PARTS}), or, if it "
-            "is no noise, a * before it."
-        )
-    return given + noise
+        told = f"{name} takes {more[0].name}, and there is no Network.draw to draw it"
+        raise UserError(f"{told}: give one ({PARTS}), or, if it is no noise, put * before it.")
+    return given
 
 
 def in_float32(network: Network) -> Network:

@@ -9,7 +9,6 @@ import numpy as np
 from purerl.physics import lookup
 
 Vector = tuple[float, float, float]
-NARROW = 5.0  # degrees: no eye sees less, and no angle in radians is as much
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,8 +28,8 @@ class Eye:
 
     def __post_init__(self) -> None:
         """Refuses what sees nothing."""
-        if not NARROW <= self.fovy < 180.0:
-            raise ValueError(f"fovy is {self.fovy}; give degrees, {NARROW:g} to less than 180.")
+        if not 5.0 <= self.fovy < 180.0:  # no angle in radians is as much
+            raise ValueError(f"fovy is {self.fovy}; give degrees, 5 to less than 180.")
         for name in ("position", "direction", "up"):
             if np.shape(given := getattr(self, name)) != (3,) or not np.isfinite(given).all():
                 raise ValueError(f"{name} is {given}; give three finite numbers.")

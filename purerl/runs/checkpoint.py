@@ -22,7 +22,8 @@ from purerl.machine import array_files, files
 from purerl.machine.state_arrays import Leaves, digest_leaves, leaf_paths, raw, unflatten
 from purerl.runs import checkpoint_folder, manifest
 
-BEGUN = "Use the settings and the version of purerl that the run began with."
+WHOLE = "Use the settings and the version of purerl that the run began with."
+PART = "A part begins as it is there: give it, and what it reads, those sizes."
 
 
 class Saved(NamedTuple):
@@ -83,16 +84,11 @@ def load_checkpoint(path: Path, abstract: PyTree, owners: Sequence[manifest.Owne
     return Saved(unflatten(leaves, abstract), meta)
 
 
-def load_leaves(
-    path: Path, like: PyTree, owners: Any, ask: Callable = bool, cure: str = BEGUN
-) -> tuple[Leaves, Any]:
-    """Reads the leaves to whose paths `ask` says yes (`bool`: to all); it raises what that does.
-
-    `cure` is what its error says of leaves of other shapes.
-    """
+def load_leaves(path: Path, like: PyTree, owners: Any, ask: Callable = bool) -> tuple[Leaves, Any]:
+    """Reads the leaves to whose paths `ask` says yes (`bool`: to all); it raises what that does."""
     meta = checkpoint_folder.load_meta(path)
     manifest.check_owner(path, meta, owners)
-    wanted = _check_fits(path, meta, like, ask, cure)
+    wanted = _check_fits(path, meta, like, ask)
     checkpoint_folder.check_files(path, meta)
     leaves = {key: np.zeros(shape, np.dtype(dtype)) for key, (dtype, shape) in wanted.items()}
     try:
@@ -176,9 +172,7 @@ def _compare(leaves: Leaves, expected: dict[str, Any]) -> None:
             raise ValueError(f"leaf {key} comes back otherwise (sha256 differs)")
 
 
-def _check_fits(
-    path: Path, meta: Any, abstract: PyTree, ask: Callable, cure: str = BEGUN
-) -> dict[str, tuple]:
+def _check_fits(path: Path, meta: Any, abstract: PyTree, ask: Callable) -> dict[str, tuple]:
     """Returns each leaf's dtype and shape; UserError if those that were saved are others."""
     shapes = [(str(x.dtype), list(x.shape)) for x in jax.tree.leaves(jax.eval_shape(raw, abstract))]
     wanted = {k: x for k, x in zip(leaf_paths(abstract), shapes, strict=True) if ask(k)}
@@ -192,7 +186,7 @@ def _check_fits(
             raise UserError(
                 f"The checkpoint {path} is of another state: leaf {key} is "
                 f"{_shown(stored.get(key))} in it and {_shown(wanted.get(key))} in this "
-                f"experiment. {cure}"
+                f"experiment. {WHOLE if ask is bool else PART}"
             )
     return wanted
 

@@ -56,8 +56,7 @@ def _read(name: str, part: Part, abstract: PyTree) -> tuple[Leaves, dict[str, An
         there = [key.removeprefix("params/") for key in stored if key.startswith("params/")]
         if not any(belongs(key, name) for key in there):
             raise UserError(unknown_name("part", name, top_names(there), f" in {run.path}"))
-        cure = f"The part {name} begins as it is there: give it, and what it reads, those sizes."
-        leaves, meta = checkpoint.load_leaves(path, abstract, owners, asked, cure)
+        leaves, meta = checkpoint.load_leaves(path, abstract, owners, asked)
     except checkpoint_folder.DamagedError as error:
         raise UserError(f"The checkpoint {path} is damaged: {error}.") from error
     facts = {"run": run.manifest["run_id"], "update": meta["update"]}

@@ -230,7 +230,7 @@ def _why_lost(programs: Programs, state: Any, records: Sequence[Record], seed: i
         return ""
     whole = programs.fetch(state)
     part, policy = check_env.lost_part(whole.env_state), jax.device_get(programs.policy(whole))
-    (loc, scale), losses = _each_seed(policy, len(records))[seed]
+    (loc, scale), _, losses = _each_seed(policy, len(records))[seed]
     # Where observations are not sound, the policy cannot be.
     if not part and not (np.isfinite(loc + scale).all() and np.min(scale) >= LEAST_SCALE):
         return (
@@ -243,15 +243,13 @@ def _why_lost(programs: Programs, state: Any, records: Sequence[Record], seed: i
             "No step of an update was sound: of each, some number of the state is NaN or absurd, "
             f"which `purerl.check_env(env)` names. {part}"
         ).strip()
-    skips = (
-        f"The last {skipped:.0f} minibatches had a non-finite loss or gradient and were skipped."
-    )
+    said = f"The last {skipped:.0f} minibatches had a non-finite loss or gradient and were skipped."
     bad = [name for name, x in losses.items() if not np.isfinite(x).all()]
     if bad and not part:
-        return f"{skips} The network's loss {', '.join(bad)} is not finite: mend it there."
-    own = f", or the network's losses ({', '.join(losses)})" * bool(losses)
-    cure = "Lower ppo.learning_rate or ppo.reward_scale, or mend the environment's reward"
-    return f"{skips} {cure}{own}."
+        return f"{said} The network's loss {', '.join(bad)} is not finite: mend it there."
+    own = f" or the network's losses ({', '.join(losses)})" * bool(losses)
+    cure = f"Lower ppo.learning_rate or ppo.reward_scale, or mend the environment's reward{own}."
+    return f"{said} {cure}"
 
 
 def _save(

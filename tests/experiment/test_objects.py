@@ -72,7 +72,7 @@ def plain(apply):
     ("network", "drawn", "silent"),
     [
         (calling(lambda self, x: x), "Mine takes (x), and is called as Mine(observation, no", ""),
-        (calling(lambda self, x, eps=None: x), "", "Mine takes eps, which is None without a"),
+        (calling(lambda self, x, eps=None: x), "", "Mine takes eps, and there is no Network"),
         (calling(lambda self, x, *given: x), "", ""),
         (calling(lambda self, x, train=False: x), "", ""),
         (calling(lambda self, x, *, mask=None: x), "Mine takes (x, *, mask=None), and", ""),
@@ -81,7 +81,7 @@ def plain(apply):
             "network.apply takes (p, x, m), and is called as network.ap",
             "",
         ),
-        (plain(lambda p, x, m, noise=None: x), "", "network.apply takes noise, which is None"),
+        (plain(lambda p, x, m, noise=None: x), "", "network.apply takes noise, and there is"),
         (plain(lambda *given: given), "", ""),
     ],
 )

@@ -137,8 +137,8 @@ def test_each_vmapped_seed_begins_with_the_part():
     [
         (["--parts.decoder.checkpoint", "7"], "There is no checkpoint '7' in "),
         (["--network.decoder", "5"], "leaf params/params/decoder/Dense_0/kernel is ['float32', [8, "
-         "1]] in it and ['float32', [5, 1]] in this experiment. The part decoder begins as it is "
-         "there: give it, and what it reads, those sizes."),
+         "1]] in it and ['float32', [5, 1]] in this experiment. A part begins as it is there: "
+         "give it, and what it reads, those sizes."),
         (["--parts.encoder.run", "x"], "There is no option --parts.encoder.run. parts names decoder"
          ": name others in the experiment's file."),
         (["--ppo.auxiliary.code-kl", "1", "2"], "--ppo.auxiliary.code-kl is '1', '2'; it must be "

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from purerl.core.records import Normal
+from purerl.core.records import Normal, PolicyOutput
 from purerl.runs.metrics_file import MAX_SKIPPED_IN_A_ROW
 from purerl.training import loop
 
@@ -17,10 +17,12 @@ NAN = float("nan")
 def why(loc=0.0, scale=1.0, observation=0.0, seeds=1, losses=(), **record):
     """Returns what is said of the last seed; a policy of the others is well."""
     policy = Normal(*(np.full((4, 2), x, np.float32) for x in (loc, scale)))
-    policy = policy, {name: np.full(4, x) for name, x in dict(losses).items()}
+    own = {name: np.full(4, x) for name, x in dict(losses).items()}
+    policy = PolicyOutput(policy, np.zeros(4), own)
     state = SimpleNamespace(env_state={"observation": np.full((4, 3), observation, np.float32)})
     if seeds > 1:
-        well = Normal(np.zeros((4, 2)), np.ones((4, 2))), {name: np.zeros(4) for name in policy[1]}
+        well = PolicyOutput(Normal(np.zeros((4, 2)), np.ones((4, 2))), np.zeros(4))
+        well = well._replace(losses={name: np.zeros(4) for name in own})
         policy = jax.tree.map(lambda *each: np.stack(each), well, policy)
     programs = SimpleNamespace(fetch={SPREAD: state}.get, policy=lambda state: policy)
     sound = {"train/parameter_norm": 1.0, "train/reward": 0.0, "train/skipped_in_a_row": 0.0}
@@ -57,5 +59,5 @@ def test_a_loss_of_the_networks_own_that_is_no_number_is_named(seeds):
     said = why(losses={"code_kl": NAN, "guess": 1.0}, **last)
     assert "The network's loss code_kl is not finite" in said and "environment" not in said
     well = why(losses={"code_kl": 0.0, "guess": 1.0}, **last)
-    assert well.endswith("environment's reward, or the network's losses (code_kl, guess).")
+    assert well.endswith("environment's reward or the network's losses (code_kl, guess).")
     assert "loss code_kl" not in why(losses={"code_kl": NAN}, observation=NAN, **last)
