@@ -33,11 +33,14 @@ def command(words: Sequence[str]) -> int:
     from purerl.checks.user_code import program_errors
     from purerl.devices import compilation
     from purerl.experiment.examine import examine
+    from purerl.experiment.loading import summary
     from purerl.training import train
 
     train.set_xla_flags_in_time()
     source, chosen, given = read_experiment(words, "python -m purerl.check", CheckOptions)
     compilation.set_up_jax(given.cache)
+    output.show(f"{source.name}: {summary(source.path)}")
+    output.show("Building and compiling first: for a large body that may take two minutes.")
     levels: list[str] = []
     with program_errors():
         for finding in examine(chosen, given.speed):

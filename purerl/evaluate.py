@@ -32,8 +32,7 @@ def command(options: EvaluateOptions) -> None:
     """Evaluates, prints the figures, and writes the file that was asked for."""
     from purerl.runs.loaded_run import load
 
-    file = options.json
-    if file is not None:
+    if (file := options.json) is not None:
         files.check_writable(file)
     run = load(options.run, options.checkpoint, options.engine, options.trust)
     result = run.evaluate(options.episodes, options.seed, options.stochastic)

@@ -16,7 +16,10 @@ from purerl.machine import command_errors, output
 
 @dataclass(frozen=True)
 class RenderOptions(PlayOptions):
-    """Makes a video (mp4) and a contact sheet (PNG) of a run's policy, in RUN/videos/."""
+    """Makes a video (mp4) and a contact sheet (PNG) of a run's policy, in RUN/videos/.
+
+    Those of a policy that comes with purerl go to videos/NAME/.
+    """
 
     camera: str = ""
     """A camera's name or number in the model; by default one that follows the body."""
@@ -46,6 +49,7 @@ def make(options: RenderOptions) -> list[str]:
     from purerl.runs.loaded_run import load
 
     run = load(options.run, options.checkpoint, options.engine, options.trust)
+    output.say("Compiling and playing: for a large body that may take two minutes.")
     about = (options.camera, options.episodes, options.seconds, size, options.seed)
     path, lines = make_video(run, *about)
     return [*lines, str(path.with_suffix(".png")), str(path)]
@@ -53,8 +57,7 @@ def make(options: RenderOptions) -> list[str]:
 
 def _parse_size(size: str) -> tuple[int, int]:
     """Returns (width, height) [pixels] of "640x480"."""
-    parts = re.fullmatch(r"(\d+)x(\d+)", size.lower())
-    if parts is None:
+    if (parts := re.fullmatch(r"(\d+)x(\d+)", size.lower())) is None:
         raise UserError(f"size is {size!r}; give width x height in pixels, such as 640x480.")
     width, height = map(int, parts.groups())
     if width % 2 or height % 2 or not 16 <= min(width, height) <= max(width, height) <= 4096:

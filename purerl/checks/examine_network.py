@@ -108,8 +108,7 @@ def _check_inputs(of_value: PyTree, of_policy: PyTree) -> Iterator[Finding]:
         for name, tree in (("value", of_value), ("policy", of_policy))
     }
     entries = list(flatten(of_value))
-    blind = [k for k in entries if k not in reads["value"]]
-    if blind:
+    if blind := [k for k in entries if k not in reads["value"]]:
         yield warning("inputs", f"the value does not depend on {_observations(blind)}.")
     own = [k for k in entries if k in ("", "policy")]
     if own and own[0] not in reads["policy"]:
@@ -133,11 +132,9 @@ def _check_parameters(gradients: PyTree, moved: PyTree, rates: PyTree) -> Findin
     Those of rate 0 shall be: they are frozen.
     """
     found, later, rates = (flatten(trained(tree)) for tree in (gradients, moved, rates))
-    broken = [name for name, x in found.items() if _bad(x)]
-    if broken:
+    if broken := [name for name, x in found.items() if _bad(x)]:
         return error("gradients", f"of {some(broken)} are not finite.")
-    idle = [name for name, x in later.items() if not x.any() and rates[name].any()]
-    if idle:
+    if idle := [name for name, x in later.items() if not x.any() and rates[name].any()]:
         what = "has none: it is" if len(idle) == 1 else "have none: they are"
         return warning("gradients", f"{some(idle)} {what} never trained.")
     return ok("gradients", f"each of {len(found)} parameters has one")

@@ -72,8 +72,8 @@ def users_errors(what: str) -> Iterator[None]:
         raise UserError(f"{what}{in_words(error)}{where}") from error
 
 
-def check_takes(name: str, function: Any, *arguments: str) -> None:
-    """Raises UserError unless a function can be called with as many arguments."""
+def check_takes(name: str, function: Any, *arguments: str, cure: str = "") -> None:
+    """Raises UserError, with the `cure`, unless a function can be called with as many arguments."""
     call = f"{name}({', '.join(arguments)})"
     if not callable(function):
         raise UserError(f"{name} is a {type(function).__name__}, and must be a function: {call}.")
@@ -84,7 +84,7 @@ def check_takes(name: str, function: Any, *arguments: str) -> None:
     try:
         taken.bind(*arguments)
     except TypeError as error:
-        raise UserError(f"{name} takes {taken}, and is called as {call}.") from error
+        raise UserError(f"{name} takes {taken}, and is called as {call}.{cure}") from error
 
 
 @contextlib.contextmanager

@@ -6,16 +6,17 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from purerl.clips.records import Clips, Motion, shortened
+from purerl.clips.records import Clips, Motion, check_rate, shortened
 from purerl.core.errors import UserError
 from purerl.physics.drawing import root_body
 
 FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 WIDTHS = {FREE: 7, int(mujoco.mjtJoint.mjJNT_BALL): 4}  # numbers in qpos; others have one
 ROOT = "root"  # what a free joint's seven columns are called, whatever file and body call it
-FARTHEST = (
-    100.0  # lengths of its own that no body is high, or goes in a second; a fly flies so fast
-)
+FARTHEST = 100.0  # lengths of its own that no body is high, or goes in a second, as a fly does
+FEW = 10  # frames by which quaternions are tried
+# Numbers [L, n] of a track's frames, and the n names that they are of.
+Measure = tuple[np.ndarray, list[str]]
 
 
 def bare(name: str) -> str:
@@ -88,18 +89,32 @@ def fit(motion: Motion, model: mujoco.MjModel, rate: float, allow: Sequence[str]
     Raises:
       UserError: the clips are of another body, or no body moves as they do.
     """
-    if not rate > 0.0:
-        raise UserError(f"rate is {rate}; it must be more than 0 [Hz].")
+    check_rate(rate)
     tracks = poses(motion, model, allow)
-    size = size_of(model)
-    for name, qpos in zip(motion.names, tracks, strict=True):
-        high = np.abs(root_places(model, qpos)[:, 2]).max()
-        fast = speeds(model, qpos, motion.rate).max()
-        if max(high, fast) > FARTHEST * size:
-            told = f"is {high:,.0f} m high or moves at {fast:,.0f} m/s, its body {size:.2g} m long"
-            raise UserError(f"Clip {name!r} {told}: are these millimetres? Give metres.")
+    for clip, qpos in enumerate(tracks):
+        if told := _other_units(motion, clip, model, qpos):
+            raise UserError(f"Clip {motion.names[clip]!r} {told}")
     tracks = [resample(model, qpos, motion.rate, rate) for qpos in tracks]
     return pack(model, tracks, motion.names, rate)
+
+
+def _other_units(motion: Motion, clip: int, model: mujoco.MjModel, qpos: np.ndarray) -> str:
+    """Returns in which other units a track [L, nq] must be, and by what that shows; else ""."""
+    size, high = size_of(model), np.abs(root_places(model, qpos)[:, 2]).max()
+    if max(high, fast := speeds(model, qpos, motion.rate).max()) > FARTHEST * size:
+        told = f"is {high:,.0f} m high or moves at {fast:,.0f} m/s, its body {size:.2g} m long"
+        return f"{told}: are these millimetres? Give metres."
+    beyond, names = beyond_ranges(model, qpos)
+    if names and np.median(beyond.max(axis=1)) > 180.0:
+        told = f"has {names[beyond.max(axis=0).argmax()]} {beyond.max():,.0f} deg beyond its range"
+        return f"{told}, and most frames are like that: are these degrees? Give radians."
+    rolled, turn = qpos[:FEW].copy(), joint_places(model).get(ROOT, [])[3:]
+    rolled[:, turn] = np.roll(rolled[:, turn], 1, axis=1)
+    now, then = (from_positions(motion, clip, model, x)[0] for x in (qpos[:FEW], rolled))
+    if now.size and now.mean() > max(1.0, 10.0 * then.mean()):
+        told = f"is {now.mean():,.1f} mm from the file's positions, and {then.mean():,.1f} if w is"
+        return f"{told} last in its quaternions: give it first."
+    return ""
 
 
 def pack(
@@ -108,8 +123,9 @@ def pack(
     """Puts tracks, qpos [L, nq] each at `rate` [Hz], into Clips, with their velocities.
 
     Raises:
-      UserError: there is not one name for each track, or two are the same.
+      UserError: there is not one name for each track, or two are the same, or `rate` is none.
     """
+    check_rate(rate)
     if len(set(names)) != len(tracks) or len(names) != len(tracks):
         many = f"{len(tracks)} tracks have {len(names)} names, {len(set(names))} of them different"
         raise UserError(f"{many}: give each track one of its own.")
@@ -180,3 +196,22 @@ def speeds(model: mujoco.MjModel, qpos: np.ndarray, rate: float) -> np.ndarray:
     """Returns how fast a free body goes from each frame to the next, [L] [m/s], at the end 0."""
     places = root_places(model, qpos)
     return np.linalg.norm(np.diff(places, axis=0, append=places[-1:]), axis=-1) * rate
+
+
+def beyond_ranges(model: mujoco.MjModel, qpos: np.ndarray) -> Measure:
+    """Returns how far each limited hinge is beyond its range [deg]."""
+    hinge = model.jnt_type == int(mujoco.mjtJoint.mjJNT_HINGE)
+    limited = np.flatnonzero(hinge & (model.jnt_limited != 0))
+    (low, high), angles = model.jnt_range[limited].T, qpos[:, model.jnt_qposadr[limited]]
+    beyond = np.rad2deg(np.maximum(low - angles, angles - high))
+    return beyond, [bare(model.joint(i).name) for i in limited]
+
+
+def from_positions(motion: Motion, clip: int, model: mujoco.MjModel, qpos: np.ndarray) -> Measure:
+    """Returns how far bodies are from where the file says, by kinematics of its own joints [mm]."""
+    own, places = kinematics(model, qpos)
+    theirs = [bare(name) for name in motion.bodies]
+    shared = [name for name in own if name in theirs]
+    told = motion.positions[clip, : len(qpos)][:, [theirs.index(name) for name in shared]]
+    apart = told - places[:, [own.index(name) for name in shared], :3]
+    return 1e3 * np.linalg.norm(apart, axis=-1), shared

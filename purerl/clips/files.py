@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from purerl.clips import body
-from purerl.clips.records import Clips, Motion, shortened
+from purerl.clips.records import Clips, Motion, check_rate, shortened
 from purerl.core.errors import UserError, reason
 from purerl.machine import files
 from purerl.machine.command_errors import check_installed
@@ -35,7 +35,7 @@ def read(path: Path | str, rate: float = 0.0, frames: int = 0) -> Motion:
 
     Raises:
       UserError: the file is not one, or cut short, or lacks something, or holds what is no number;
-        or `rate` is neither here nor there, or another.
+        or `rate` is neither here nor there, or another, or none.
     """
     check_installed("h5py", "clips")
     import h5py
@@ -57,6 +57,7 @@ def read(path: Path | str, rate: float = 0.0, frames: int = 0) -> Motion:
         raise UserError(f"{path} does not say its rate: give it, as rate=50 or --rate 50 [Hz].")
     if motion.rate and rate and motion.rate != rate:
         raise UserError(f"{path} is of {motion.rate:g} Hz, not {rate:g}: leave the rate out.")
+    check_rate(motion.rate or rate)
     return motion._replace(rate=motion.rate or float(rate))
 
 
@@ -105,8 +106,7 @@ def _read_flat(path: Path, file: Any, frames: int) -> Motion:
     qpos = get("qpos", 2)
     names = tuple(map(str, config.get("model", {}).get("snips_order", ())))
     frames = frames or config.get("stac", {}).get("n_frames_per_clip", 0)
-    frames = frames or len(qpos) // max(1, len(names)) * bool(names)
-    if not frames:
+    if not (frames := frames or len(qpos) // max(1, len(names)) * bool(names)):
         raise UserError(f"{path} does not say how long its clips are: give it, as --frames 250.")
     number = len(qpos) // frames
     if number * frames != len(qpos) or len(names) not in (0, number):

@@ -53,6 +53,12 @@ def shortened(names: Iterable[str], most: int = 8) -> str:
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
+def check_rate(rate: float) -> None:
+    """Raises UserError for what is no rate [Hz], but perhaps the seconds from a frame to a next."""
+    if not 2.0 <= rate < np.inf:  # nothing is recorded more slowly
+        raise UserError(f"rate is {rate:g}; give frames a second, 2 Hz or more: 0.02 s are 50 Hz.")
+
+
 def choose(clips: Clips, *names: str) -> Clips:
     """Returns the clips of these names or behaviours, in the order in which they are in `clips`.
 
@@ -80,8 +86,10 @@ def split(clips: Clips, held_out: float = 0.2, seed: int = 0) -> tuple[Clips, Cl
       The clips to train with, and those held out.
 
     Raises:
-      UserError: one side is empty.
+      UserError: that is no share, or one side is empty.
     """
+    if not 0.0 < held_out < 1.0:
+        raise UserError(f"held_out is {held_out}; it must be a share, above 0 and below 1.")
     hashes = [hashlib.sha256(f"{seed}/{name}".encode()).digest() for name in clips.names]
     out = np.array([int.from_bytes(x[:6], "big") < held_out * 2**48 for x in hashes])
     if out.all() or not out.any():

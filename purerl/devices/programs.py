@@ -14,7 +14,7 @@ import jax
 
 from purerl.core.env import Env
 from purerl.core.keys import Purpose, derive
-from purerl.core.records import Array, Metrics, Network, Normal, PyTree, TrainState
+from purerl.core.records import Array, Metrics, Network, PolicyOutput, PyTree, TrainState
 from purerl.devices import compilation, multi_device
 from purerl.devices.shards import Shards, improve
 from purerl.ppo import algorithm, episodes
@@ -32,7 +32,7 @@ class Programs(NamedTuple):
     update: Callable[[Any], tuple[Any, Metrics]]
     evaluate: Callable[[Any], Metrics]
     seconds: dict[str, float]  # that each took to compile, side by side; without the evaluation
-    policy: Callable[[TrainState], Normal]  # [B, A] of a fetched state
+    policy: Callable[[TrainState], PolicyOutput]  # [B, ...] of a fetched state
     unordered: list[str]  # sums of the update whose order nothing fixes on a GPU
     spread: Callable[[TrainState], Any] = compilation.as_it_is  # onto the devices, for the others
     fetch: Callable[[Any], TrainState] = compilation.as_it_is  # back onto one
@@ -109,9 +109,10 @@ def evaluate_in_run(
     return evaluate_policy(env, network, state, key, num_episodes, config.episode_length)
 
 
-def policy_of(network: Network, state: TrainState) -> Normal:
-    """Returns the policy in the environments of a state, [B, A]."""
-    return episodes.act(network, state, state.env_state, state.memory)[0].distribution
+def policy_of(network: Network, state: TrainState) -> PolicyOutput:
+    """Returns what the network says in the environments of a state, [B, ...]."""
+    drawn = episodes.draw(network, state.key, state.env_ids, state.update)
+    return episodes.act(network, state, state.env_state, state.memory, drawn)[0]
 
 
 def compile_update(

@@ -8,7 +8,7 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, get_args
 
 import tyro
 
@@ -22,6 +22,7 @@ from purerl.machine import command_errors, output
 CONFIG = (tyro.conf.FlagCreatePairsOff,)
 # A flag takes a word, True or False, as every other option does.
 WORDS = (tyro.conf.FlagConversionOff,)
+RULES = tyro.constructors.ConstructorRegistry()
 # Gives back an experiment with the overrides of a command line, and the command's options.
 Over = Callable[..., tuple[Experiment, Any]]
 
@@ -180,23 +181,44 @@ def parse(
       UserError: there is no such option (the message has the nearest one), or a value is wrong.
     """
     said = io.StringIO()
-    extra = {} if base is None else {"default": base}
+    extra = {"registry": RULES} | ({} if base is None else {"default": base})
     try:
         with output.answering(), contextlib.redirect_stderr(said):
             return tyro.cli(kind, args=list(words), prog=prog, config=config, **extra, **more)
     except SystemExit as error:
         if not error.code:
             raise
-        what = _one_line(said.getvalue(), _option_names(kind, base))
+        what = _one_line(said.getvalue(), _option_names(kind, base), base)
         raise UserError(f"{what} All options: {prog} --help") from error
 
 
-def _one_line(text: str, names: list[str]) -> str:
+@RULES.struct_rule
+def _of_annotated_kind(info: Any) -> Any:
+    """Lets an entry of a dict be of each annotated kind: tyro takes that of its default alone."""
+    kinds, default = get_args(info.type), info.default
+    if not (isinstance(default, dict) and default and get_args(kinds and kinds[-1])):
+        return None
+    field = tyro.constructors.StructFieldSpec
+    fields = tuple(field(name, kinds[-1], value) for name, value in default.items())
+    return tyro.constructors.StructConstructorSpec(dict, fields)
+
+
+def _entries(option: str, value: Any) -> str:
+    """Returns which entries a dict of the settings `value` has, where an option names another."""
+    path = option[2:].replace("-", "_").split(".")
+    for i, word in enumerate(path):
+        if isinstance(value, dict) and word not in value:
+            names = f"{'.'.join(path[:i])} names {', '.join(value) or 'none'}"
+            return f"{names}: name others in the experiment's file."
+        value = value[word] if isinstance(value, dict) else getattr(value, word, None)
+    return ""
+
+
+def _one_line(text: str, names: list[str], base: Any) -> str:
     """Returns tyro's framed, coloured message as one line: what is wrong, and the nearest fix."""
     text = re.sub(r"\x1b\[[0-9;]*m", "", text)
     plain = " ".join(re.sub(r"[─-╿]|-{5,}", " ", text).split())
-    unknown = re.search(r"Unrecognized options: (\S+?)[,=]? ", plain)
-    if unknown:
+    if unknown := re.search(r"Unrecognized options: (\S+?)[,=]? ", plain):
         if unknown[1] in ("True", "False"):
             return "A switch takes no value: give its option alone, or leave it out."
         if unknown[1] in names:  # a bool that is true: what turns it off is its only option
@@ -204,7 +226,7 @@ def _one_line(text: str, names: list[str]) -> str:
             return f"{unknown[1]} takes no value; --{group}{dot}no-{name} turns it off."
         if not unknown[1].startswith("-"):
             return f"{unknown[1]!r} follows no option; write one before it, as in --name x."
-        hint = other_trainers.suggest(unknown[1], names)
+        hint = _entries(unknown[1], base) or other_trainers.suggest(unknown[1], names)
         return f"There is no option {unknown[1]}. {hint}".strip()
     titles = "Value error|Missing argument|Invalid choice|Parsing error|Required options"
     plain = re.sub(rf"^({titles}) ", "", plain)
@@ -229,6 +251,11 @@ _IN_WORDS: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
         r"^Error parsing (\S+): Could not find valid parse for arguments: \[(.*)\]",
         r"\1 is \2; write numbers with spaces between them, such as 64 64",
     ),
+    (
+        r"^Error parsing (\S+): no type matching (.+?) could.*?\[(.*?)\].*",
+        r"\1 is \3; it must be \2",
+    ),
+    (r"\|\{([A-Z ]+)\}", r" or \1"),  # FLOAT|{FLOAT FLOAT INT}
     (r"^invalid choice (.*) for argument '(\S+)'.*\((.*)\)", _wrong_choice),
     (r"^Missing from .*?: [A-Z.,\[\]{} ]+?(?=[A-Z][a-z'])", "The command lacks: "),
     (r" \(required\)", ""),

@@ -27,7 +27,7 @@ class Part:
     rate: float = 1.0
     """Factor on the learning rate of its parameters; 0: frozen."""
     run: str = ""
-    """Folder of the run whose parameters it begins with; empty: they are drawn."""
+    """Run that it begins as: a folder, or a policy of purerl's, such as ant_gaps; empty: drawn."""
     checkpoint: str = "latest"
     """Of that run: latest, best (highest evaluation return), or an update's number."""
     reads: tuple[str, ...] | None = None

@@ -1,6 +1,7 @@
 """An experiment's objects, built from its settings; what breaks a rule of theirs, in one line."""
 
 import contextlib
+import inspect
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -18,9 +19,11 @@ from purerl.experiment import settings_json
 from purerl.experiment.definition import Experiment, Part
 from purerl.experiment.kinds import wrong_value
 from purerl.experiment.network_parts import with_parts
-from purerl.ppo import episodes
+from purerl.ppo import episodes, networks
 from purerl.ppo.config import Config
 from purerl.ppo.learner import is_recurrent
+
+PARTS = "docs/howto/network_parts.md"
 
 
 class Setup(NamedTuple):
@@ -152,9 +155,8 @@ def _check_network(network: Network, observation: PyTree, action_size: int) -> t
             "purerl.Network(init, apply). Of a Flax module, networks.from_linen makes one."
         )
     check_takes("network.init", network.init, "key")
-    given = ["params", "observation", "memory"] + ["noise"] * (network.draw is not None)
-    check_takes("network.apply", network.apply, *given)
     params, carry = _pair("init(key)", "parameters", network.init, jax.random.key(0))
+    given = _taken(network, carry)
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
             raise ValueError(
@@ -191,6 +193,24 @@ def _check_network(network: Network, observation: PyTree, action_size: int) -> t
             "environments; `apply` must return it as it was given, and `init` one environment's."
         )
     return params, output
+
+
+def _taken(network: Network, carry: PyTree) -> list[str]:
+    """Returns what `apply` is called with; UserError unless it takes noise just if it is drawn."""
+    noise = ["noise"] * (network.draw is not None)
+    given = ["params", "observation", "memory", *noise]
+    name, function, taken = "network.apply", network.apply, given
+    if getattr(function, "__module__", "") == networks.__name__:  # the module says more
+        module = inspect.getclosurevars(function).nonlocals["module"]
+        name, function = type(module).__name__, module.__call__
+        taken = ["observation", *["memory"] * bool(jax.tree.leaves(carry)), *noise]
+    cure = f" Let it take what Network.draw draws, as noise=None, or leave draw out ({PARTS})."
+    check_takes(name, function, *taken, cure=cure * len(noise))
+    more = list(inspect.signature(function).parameters.values())[len(taken) :]
+    if not noise and more and more[0].default is None and more[0].kind < more[0].KEYWORD_ONLY:
+        told = f"{name} takes {more[0].name}, and there is no Network.draw to draw it"
+        raise UserError(f"{told}: give one ({PARTS}), or, if it is no noise, put * before it.")
+    return given
 
 
 def in_float32(network: Network) -> Network:
@@ -253,8 +273,7 @@ def naming_broken_rules(env: Env) -> Iterator[None]:
 
 def physics_hash(env: Env) -> str | None:
     """Returns a sha256 of the model that an environment simulates; None if it has no `physics`."""
-    model = getattr(getattr(env, "physics", None), "model", None)
-    if model is None:
+    if (model := getattr(getattr(env, "physics", None), "model", None)) is None:
         return None
     from purerl.physics.lookup import hash_model
 

@@ -28,8 +28,8 @@ class Eye:
 
     def __post_init__(self) -> None:
         """Refuses what sees nothing."""
-        if not 0.0 < self.fovy < 180.0:
-            raise ValueError(f"fovy is {self.fovy}; give degrees, more than 0 and less than 180.")
+        if not 5.0 <= self.fovy < 180.0:  # no angle in radians is as much
+            raise ValueError(f"fovy is {self.fovy}; give degrees, 5 to less than 180.")
         for name in ("position", "direction", "up"):
             if np.shape(given := getattr(self, name)) != (3,) or not np.isfinite(given).all():
                 raise ValueError(f"{name} is {given}; give three finite numbers.")

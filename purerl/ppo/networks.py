@@ -208,8 +208,7 @@ def recurrent(options: RecurrentOptions, observation: PyTree, action_size: int) 
       action_size: A.
     """
     check_observation(observation)
-    module = RecurrentActorCritic(options, action_size)
-    return from_linen(module, observation, no_memory(options))
+    return from_linen(RecurrentActorCritic(options, action_size), observation, no_memory(options))
 
 
 def no_memory(options: RecurrentOptions) -> PyTree:

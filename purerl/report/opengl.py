@@ -23,8 +23,7 @@ def choose_gl(find: Callable[[str], str | None] = ctypes.util.find_library) -> s
     Raises:
       RunError: there is no OpenGL; the message says what to install.
     """
-    chosen = os.environ.get("MUJOCO_GL", "").lower()
-    if not chosen:
+    if not (chosen := os.environ.get("MUJOCO_GL", "").lower()):
         if Path("/dev/nvidiactl").exists() and find("EGL_nvidia"):
             chosen = "egl"
         elif find("OSMesa"):

@@ -22,6 +22,9 @@ from purerl.machine import array_files, files
 from purerl.machine.state_arrays import Leaves, digest_leaves, leaf_paths, raw, unflatten
 from purerl.runs import checkpoint_folder, manifest
 
+WHOLE = "Use the settings and the version of purerl that the run began with."
+PART = "A part begins as it is there: give it, and what it reads, those sizes."
+
 
 class Saved(NamedTuple):
     """One checkpoint read back, every hash checked."""
@@ -183,7 +186,7 @@ def _check_fits(path: Path, meta: Any, abstract: PyTree, ask: Callable) -> dict[
             raise UserError(
                 f"The checkpoint {path} is of another state: leaf {key} is "
                 f"{_shown(stored.get(key))} in it and {_shown(wanted.get(key))} in this "
-                "experiment. Use the settings and the version of purerl that the run began with."
+                f"experiment. {WHOLE if ask is bool else PART}"
             )
     return wanted
 

@@ -79,8 +79,7 @@ class MetricsFile:
         try:
             rest = self.pending
             while rest:  # after half of it, the rest meets the reason, such as a full disk
-                written = self.file.write(rest)
-                if not written:
+                if not (written := self.file.write(rest)):
                     raise OSError("nothing was written")
                 rest = rest[written:]
         except OSError:

@@ -13,6 +13,7 @@ import numpy as np
 from purerl.core.errors import UserError, unknown_name
 from purerl.core.records import Array, PyTree
 from purerl.experiment.definition import Part
+from purerl.experiment.loading import shipped
 from purerl.experiment.network_parts import belongs, is_held, map_named, top_names
 from purerl.machine.state_arrays import Leaves, digest_leaves
 from purerl.runs import checkpoint, checkpoint_folder, manifest
@@ -33,8 +34,7 @@ def read_parts(parts: Mapping[str, Part], abstract: PyTree) -> tuple[Leaves, dic
     leaves, facts = Leaves(), dict[str, Any]()
     for name, part in ((name, part) for name, part in parts.items() if part.run):
         found, facts[name] = _read(name, part, abstract)
-        twice = [key for key in found if (found[key] != leaves.get(key, found[key])).any()]
-        if twice:
+        if twice := [key for key in found if (found[key] != leaves.get(key, found[key])).any()]:
             raise UserError(f"parts.{name}: {twice[0]} is another in the run of a part before it.")
         leaves |= found
     return leaves, facts
@@ -42,7 +42,7 @@ def read_parts(parts: Mapping[str, Part], abstract: PyTree) -> tuple[Leaves, dic
 
 def _read(name: str, part: Part, abstract: PyTree) -> tuple[Leaves, dict[str, Any]]:
     """Returns one part's arrays, and the statistics that it reads by; and whose they are."""
-    run = read_run(Path(part.run))
+    run = read_run(shipped(part.run) or Path(part.run))
     path, owners = find_checkpoint(run, part.checkpoint), manifest.owners(check_manifest(run))
 
     def asked(key: str) -> bool:

@@ -182,8 +182,7 @@ def shown_record(records: Sequence[Record]) -> Record:
 
     The length is that of the seed with the longest.
     """
-    returns = [r["train/episode_return"] for r in records]
-    known = [value for value in returns if value is not None]
+    known = [value for value in [r["train/episode_return"] for r in records] if value is not None]
     return records[0] | {
         "train/episode_return": sum(known) / len(known) if known else None,
         "train/nonfinite_resets": sum(r["train/nonfinite_resets"] for r in records),
@@ -201,8 +200,7 @@ def _check_finite(
     seed that is lost cannot be saved.
     """
     reasons = [_why_lost(programs, state, records, seed) for seed in range(len(records))]
-    lost = next((seed for seed, reason in enumerate(reasons) if reason), None)
-    if lost is None:
+    if (lost := next((seed for seed, reason in enumerate(reasons) if reason), None)) is None:
         return
     for writer, record in zip(writers, records, strict=True):
         writer.write(record)
@@ -230,7 +228,7 @@ def _why_lost(programs: Programs, state: Any, records: Sequence[Record], seed: i
         return ""
     whole = programs.fetch(state)
     part, policy = check_env.lost_part(whole.env_state), jax.device_get(programs.policy(whole))
-    loc, scale = _each_seed(policy, len(records))[seed]
+    (loc, scale), _, losses = _each_seed(policy, len(records))[seed]
     # Where observations are not sound, the policy cannot be.
     if not part and not (np.isfinite(loc + scale).all() and np.min(scale) >= LEAST_SCALE):
         return (
@@ -243,10 +241,13 @@ def _why_lost(programs: Programs, state: Any, records: Sequence[Record], seed: i
             "No step of an update was sound: of each, some number of the state is NaN or absurd, "
             f"which `purerl.check_env(env)` names. {part}"
         ).strip()
-    return (
-        f"The last {skipped:.0f} minibatches had a non-finite loss or gradient and were skipped. "
-        "Lower ppo.learning_rate or ppo.reward_scale, or mend the environment's reward."
-    )
+    said = f"The last {skipped:.0f} minibatches had a non-finite loss or gradient and were skipped."
+    bad = [name for name, x in losses.items() if not np.isfinite(x).all()]
+    if bad and not part:
+        return f"{said} The network's loss {', '.join(bad)} is not finite: mend it there."
+    own = f" or the network's losses ({', '.join(losses)})" * bool(losses)
+    cure = f"Lower ppo.learning_rate or ppo.reward_scale, or mend the environment's reward{own}."
+    return f"{said} {cure}"
 
 
 def _save(

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from purerl import check
 from purerl.checks import check_env, examine_env, examine_network
 from purerl.checks.examine_physics import check_controls, check_placed, check_ranges, check_solver
 from purerl.core.env import State
@@ -24,6 +25,7 @@ from purerl.physics.interface import Physics
 from purerl.ppo.config import Config
 from purerl.ppo.networks import MlpOptions, RecurrentOptions, from_linen, mlp, recurrent
 from tests.checks.test_check_env import Toy, toy_state
+from tests.runs import toy_experiment
 from tests.runs.toy_experiment import experiment
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("compiled_quickly")]
@@ -218,6 +220,21 @@ def test_speed_is_measured_only_when_asked(monkeypatch):
     assert told.endswith("takes 0.01 s, so timing 4 takes about 0 s, and compiling")
     assert alone == "64 steps/s of the environments alone"
     assert update.startswith("16 steps/s in an update of 2.00 s: 12 updates take 0.4 min")
+
+
+def test_the_command_says_what_is_checked_before_it_is_built(monkeypatch, capsys):
+    said = []
+
+    def found(chosen, speed):
+        said.append(capsys.readouterr().out)
+        return iter(())
+
+    monkeypatch.setattr(examine, "examine", found)
+    assert check.main([toy_experiment.__file__]) == 0
+    told, waits = said[0].splitlines()
+    assert told == f"toy_experiment: {toy_experiment.__doc__.strip()}"
+    assert waits.startswith("Building and compiling first")
+    assert capsys.readouterr().out == "toy_experiment: 0 errors, 0 warnings\n"
 
 
 @dataclasses.dataclass(frozen=True)

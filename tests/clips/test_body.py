@@ -142,6 +142,38 @@ def test_millimetres_are_refused(model):
         clips.fit(motion(changed(3, 0, 100.0)), model, 50.0)
 
 
+def test_degrees_are_refused_and_a_frame_that_jumps_is_not(model):
+    values = np.stack(bodies.tracks((16, 16)))
+    values[..., 7:] = np.rad2deg(values[..., 7:])
+    with pytest.raises(UserError, match=r"'Walk_0' has hip 1,\d\d\d deg beyond .* Give radians\.$"):
+        clips.fit(motion(values), model, 50.0)
+    clips.fit(motion(changed(3, 7, 20.0)), model, 50.0)
+
+
+def test_quaternions_with_w_last_are_refused_where_the_file_has_positions(model):
+    values = np.stack(bodies.tracks((16, 16)))
+    names, places = bodies.places(values)
+    values[..., 3:7] = np.roll(values[..., 3:7], -1, axis=-1)
+    told = motion(values, bodies=tuple(names), positions=places)
+    with pytest.raises(
+        UserError, match=r"'Walk_0' is \d+.\d mm .*, and 0.0 if w is last in .* first\.$"
+    ):
+        clips.fit(told, model, 50.0)
+    apart = motion(bodies=tuple(names), positions=places + 0.1)  # for another reason
+    clips.fit(apart, model, 50.0)
+    clips.fit(motion(values), model, 50.0)
+
+
+@pytest.mark.parametrize("rate", [0.02, 0.0, -50.0, np.nan, np.inf])
+def test_seconds_are_no_rate(model, rate):
+    with pytest.raises(
+        UserError, match="rate is .*; give frames a second, 2 Hz or more: 0.02 s are 50"
+    ):
+        clips.fit(motion(), model, rate)
+    with pytest.raises(UserError, match="give frames a second"):
+        clips.pack(model, [np.zeros((5, model.nq))], ["a"], rate)
+
+
 def test_a_body_of_one_part_has_a_size():
     ball = '<body><freejoint/><geom size="0.1"/></body>'
     drone = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{ball}</worldbody></mujoco>")
@@ -177,11 +209,10 @@ def test_each_oddity_is_measured_and_placed(model):
     )
 
 
-def test_what_could_not_be_compared_is_unknown():
+def test_what_cannot_be_compared_is_left_out():
     bare = bodies.XML.replace('<geom name="floor" type="plane" size="5 5 1"/>', "")
     _, line = examine.examine(motion(), mujoco.MjModel.from_xml_string(bare))
-    assert "unknown mm below the floor; 0.00 deg" in line
-    assert line.endswith("unknown mm from the file's positions")
+    assert "floor" not in line and "positions" not in line and "; 0.00 deg beyond" in line
 
 
 @pytest.mark.parametrize(

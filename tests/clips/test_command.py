@@ -37,7 +37,7 @@ def test_they_are_checked_cut_and_drawn_with_one(file, capsys, tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     assert command.main([str(file), *BODY]) == 0
     first, _ = capsys.readouterr().out.splitlines()
-    assert first.startswith("Roll_1: Roll, 1.00 s, 51 frames at 50 Hz; 0.00 m/s; unknown mm below")
+    assert first.startswith("Roll_1: Roll, 1.00 s, 51 frames at 50 Hz; 0.00 m/s; ")
     words = ["--cut", "Roll_1", "0.2", "0.6", "-o", "part.h5", "--draw", "Hang_2"]
     assert command.main([str(file), *BODY, *words]) == 0
     assert command.main([str(file), *BODY, *words]) == 2, "part.h5 is there"

@@ -151,6 +151,8 @@ def test_a_file_that_is_cut_short_or_no_hdf5_or_not_there(tmp_path):
 
 def test_the_rate_is_the_files_or_given_and_never_both(tmp_path, model):
     bodies.write(tmp_path / "a.h5", bodies.named_arrays())
+    with pytest.raises(UserError, match="rate is 0.02; give frames a second"):
+        clips.read(tmp_path / "a.h5", rate=0.02)
     with pytest.raises(UserError, match="does not say its rate"):
         clips.read(tmp_path / "a.h5")
     fitted = clips.fit(clips.read(tmp_path / "a.h5", rate=50.0), model, 50.0)

@@ -48,6 +48,9 @@ def test_a_clip_is_on_one_side_whatever_else_there_is():
     assert clips.split(some(NAMES[:20]), 0.2)[1].names == ("Walk_0.p", "Walk_16.p")
     with pytest.raises(UserError, match="0 of 60 clips are held out, and neither side"):
         clips.split(some(), 1e-9)
+    for share in (30, 0.0, 1.0, float("nan")):
+        with pytest.raises(UserError, match=f"held_out is {share}; it must be a share"):
+            clips.split(some(), share)
 
 
 def test_a_part_is_cut_with_both_its_ends():

@@ -7,6 +7,7 @@ from PIL import Image
 
 from purerl.envs.suite import pendulum
 from purerl.envs.suite.tasks import TASKS
+from purerl.experiment.loading import available
 from purerl.experiments.benchmarks import gallery
 from tests.docs.blocks import ROOT
 
@@ -21,6 +22,14 @@ def test_every_body_and_task_has_its_row():
     rows = ROW.findall(PAGE)
     assert [name for name, _, _ in rows] == NAMES
     assert all(command.endswith(name) for name, command, _ in rows)
+
+
+def test_every_experiment_is_told_of():
+    readme = (ROOT / "README.md").read_text()
+    names = [name for name in available() if name != "custom_network"]  # which is to be copied
+    assert len(names) >= 11
+    assert not [name for name in names if f"`python -m purerl.run {name}" not in PAGE]
+    assert not [name for name in names if f"`{name}`" not in readme]
 
 
 def test_pictures_are_there_and_small():

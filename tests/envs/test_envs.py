@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from purerl.checks.check_env import check_env
-from purerl.envs import arenas, cartpole_swingup, run
+from purerl.envs import arenas, cartpole_swingup, randomization, run
 from purerl.envs.bodies import ANT, RODENT
 from purerl.experiments.peers import brax_env
 from purerl.physics.interface import PhysicsState
@@ -169,7 +169,7 @@ def test_target_reward_is_linear_up_to_the_target(speed, reward):
     assert float(sum(terms.values())) == pytest.approx(reward)
 
 
-GAPS = run.Options(arena="gaps", randomization=run.Randomization(friction=(0.5, 1.5)))
+GAPS = run.Options(arena="gaps", randomization=randomization.Randomization(friction=(0.5, 1.5)))
 
 
 def test_every_episode_has_a_corridor_and_a_friction_of_its_own():
@@ -281,7 +281,7 @@ def test_at_the_end_of_a_corridor_the_platform_underfoot_is_still_the_first(leng
 @pytest.mark.parametrize("words", [{"friction": (0.0, 1.0)}, {"gear": (2.0, 1.0)}])
 def test_impossible_factors_are_refused(words):
     with pytest.raises(ValueError, match="give factors"):
-        run.Randomization(**words)
+        randomization.Randomization(**words)
 
 
 def cartpole_at(angle, spin=0.0, position=0.0):

@@ -82,7 +82,8 @@ def test_each_kind_is_where_mujocos_rays_meet_it(kind):
     """1 s each. From eight sides, askew; four from afar, where b^2 - a c would cancel."""
     model, random, hits = model_of(KINDS[kind]), np.random.default_rng(0), 0
     for far, fovy in ((1.0, 60.0), (100.0, 0.6)):
-        eye = dataclasses.replace(EYE, fovy=fovy)
+        eye = dataclasses.replace(EYE)
+        object.__setattr__(eye, "fovy", fovy)  # narrower than an eye may be
         distances = quick.jit(eyes.Eyes(model, [eye], (15, 15), reach=1e3).distance)
         for side in random.normal(size=(4, 3)):
             side[2] = abs(side[2])
@@ -246,7 +247,8 @@ def test_a_camera_of_the_model_is_an_eye():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: eyes.Eye("head", fovy=180.0), "fovy is 180.0; give degrees, more than 0 and less"),
+        (lambda: eyes.Eye("head", fovy=180.0), "fovy is 180.0; give degrees, 5 to less than 180."),
+        (lambda: eyes.Eye("head", fovy=1.4), "fovy is 1.4; give degrees, 5 to less than 180."),
         (lambda: eyes.Eye("head", up=(2.0, 0, 0)), "are parallel or 0"),
         (
             lambda: eyes.pair(EYE, 0.1, 61.0),

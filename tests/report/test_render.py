@@ -81,6 +81,7 @@ def test_video_and_sheet_show_the_episode_in_real_time(trained, capsys):
         frame = np.asarray(Image.fromarray(frames[moment]).resize((320, 240)), int)
         assert np.abs(cells[y : y + 240, x : x + 320] - frame).mean() < 3
     said = capsys.readouterr().out
+    assert said.startswith("Compiling and playing: ")
     assert "update 3, episode 2: 0.8 s (cut there)" in said
     files = [line.rpartition("/")[2] for line in said.splitlines()[-2:]]
     assert files == ["000000000003.png", "000000000003.mp4"]

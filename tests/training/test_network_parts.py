@@ -14,7 +14,9 @@ from purerl.checks import examine_network
 from purerl.core.errors import INTERRUPTED, SUCCESS, USAGE, UserError
 from purerl.devices.programs import abstract_state
 from purerl.experiment import objects
+from purerl.experiment.command_line import from_command_line
 from purerl.experiment.definition import Part
+from purerl.experiment.loading import find_source
 from purerl.machine import array_files
 from purerl.machine.state_arrays import flatten
 from purerl.runs import checkpoint_folder, taken_parts
@@ -135,7 +137,12 @@ def test_each_vmapped_seed_begins_with_the_part():
     [
         (["--parts.decoder.checkpoint", "7"], "There is no checkpoint '7' in "),
         (["--network.decoder", "5"], "leaf params/params/decoder/Dense_0/kernel is ['float32', [8, "
-         "1]] in it and ['float32', [5, 1]] in this experiment."),
+         "1]] in it and ['float32', [5, 1]] in this experiment. A part begins as it is there: "
+         "give it, and what it reads, those sizes."),
+        (["--parts.encoder.run", "x"], "There is no option --parts.encoder.run. parts names decoder"
+         ": name others in the experiment's file."),
+        (["--ppo.auxiliary.code-kl", "1", "2"], "--ppo.auxiliary.code-kl is '1', '2'; it must be "
+         "FLOAT or FLOAT FLOAT INT."),
         (["--parts.decoder.run", "nowhere"], "nowhere"),
         (["--parts.decoder.reads", "eyes"], "There is no entry of the observation 'eyes'. There "
          "are: policy."),
@@ -152,6 +159,17 @@ def test_the_parts_that_the_other_run_has_are_named(old):
     abstract = abstract_state(*objects.build(coded_experiment.experiment)[:3])
     with pytest.raises(UserError, match="no part 'muscles' in .* There are: critic, decoder, enc"):
         taken_parts.read_parts({"muscles": Part(run=str(old), reads=())}, abstract)
+    with pytest.raises(UserError, match="no part 'muscles' in .*/cartpole_swingup. There are: hea"):
+        taken_parts.read_parts({"muscles": Part(run="cartpole_swingup", reads=())}, abstract)
+
+
+@pytest.mark.parametrize(("given", "is_then"), [("0.2", 0.2), ("0.1 0.2 9", (0.1, 0.2, 9))])
+@pytest.mark.parametrize("name", ["code_kl", "sparsity"])
+def test_a_weight_is_given_in_either_form_whatever_the_file_has(name, given, is_then):
+    words = [f"--ppo.auxiliary.{name.replace('_', '-')}", *given.split(), "--seed", "3"]
+    chosen, _ = from_command_line(find_source(CODED), words, "run")
+    weights = coded_experiment.experiment.ppo.auxiliary
+    assert chosen.ppo.auxiliary == weights | {name: is_then}
 
 
 def test_a_part_of_another_run_needs_its_units():

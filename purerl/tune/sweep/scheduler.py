@@ -148,8 +148,7 @@ def environment_of(slot: int, at_once: int, gpus: list[str]) -> dict[str, str]:
     if len(gpus) > 1:
         found["CUDA_VISIBLE_DEVICES"] = gpus[slot % len(gpus)]
     if gpus and at_once > len(gpus):  # JAX alone would take three quarters of its memory
-        share = 0.9 / -(-at_once // len(gpus))
-        found["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{share:.2f}"
+        found["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{0.9 / -(-at_once // len(gpus)):.2f}"
     return found
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from purerl import UserError
-from purerl.envs import run
+from purerl.envs import randomization, run
 from purerl.experiment.command_line import from_command_line
 from purerl.experiment.loading import find_source
 from purerl.physics.drawing import Picture, Stage
@@ -34,7 +34,7 @@ def test_every_number_of_the_options_has_a_place():
 
 
 def test_a_rule_sees_all_numbers_that_change_together():
-    options = run.Randomization(friction=(0.5, 0.9))
+    options = randomization.Randomization(friction=(0.5, 0.9))
     changed = replaced(options, {("friction", 0): 1.5, ("friction", 1): 2.0})
     assert changed.friction == (1.5, 2.0)
     with pytest.raises(ValueError, match="friction"):
@@ -58,7 +58,7 @@ def test_the_shown_command_makes_the_setting():
     source = find_source("ant_gaps")
     env = dataclasses.replace(
         source.experiment.env, gap_length=(0.1, 0.35), observe_place=True, forward_weight=0.1 + 0.2,
-        randomization=run.Randomization(mass=(0.5, 1.5)), least_height=0.2, substeps=4,
+        randomization=randomization.Randomization(mass=(0.5, 1.5)), least_height=0.2, substeps=4,
     )  # fmt: skip
     chosen = dataclasses.replace(
         source.experiment, ppo=dataclasses.replace(source.experiment.ppo, schedule="constant")
