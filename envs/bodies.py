@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable
 
 from dm_control import mjcf
-from dm_control.locomotion.walkers import ant as dm_ant, rodent as dm_rodent
+from dm_control.locomotion.walkers import ant as dm_ant, cmu_humanoid, rodent as dm_rodent
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +40,10 @@ def _ant_mjcf() -> mjcf.RootElement:
 
 def _rodent_mjcf() -> mjcf.RootElement:
     return dm_rodent.Rat().mjcf_model
+
+
+def _humanoid_mjcf() -> mjcf.RootElement:
+    return cmu_humanoid.CMUHumanoidPositionControlled().mjcf_model
 
 
 def _both_sides(*names: str) -> tuple[str, ...]:
@@ -107,4 +111,23 @@ RODENT = Body(
     mjx_iterations=(6, 12),
     camera="egocentric",
     eye_distance=0.008,
+)
+
+# Of the CMU's recordings, with servos: an action is a pose. In qpos0 it lies, its y-axis up.
+HUMANOID = Body(
+    name="humanoid",
+    build=_humanoid_mjcf,
+    torso="root",
+    end_effectors=("rradius", "lradius", "rfoot", "lfoot"),
+    ground_geoms=(),
+    spawn_height=0.94,
+    healthy_height=(0.5, 1.5),
+    healthy_turn=math.inf,
+    reach=1.2,
+    longest_gap=1.0,
+    sight=4.0,
+    timestep=0.005,
+    mjx_iterations=(4, 8),
+    camera="egocentric",
+    eye_distance=0.06,
 )

@@ -1,0 +1,270 @@
+"""Imitation of recorded motion: a body is to move as a clip does, from any frame of it.
+
+The clips are arrays of the environment, a frame for each control step. Which clip an episode
+follows and where it is in it are whole numbers in `state.task`: no clock is rounded.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from purerl import (
+    Array,
+    Physics,
+    PhysicsState,
+    State,
+    clips,
+    lookup,
+    overflow_metric,
+    overflow_reading,
+)
+from purerl.envs import body_parts, recordings, tracking
+from purerl.envs.body_parts import Parts
+from purerl.envs.tracking import Effort, Pose
+
+READINGS = ("xpos", "xquat", "xmat", "qfrc_actuator")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Settings of the task."""
+
+    body: str = "rodent"
+    """ant, rodent, humanoid, or the path of an MJCF file: a body with actuators, on its floor."""
+    end_effectors: tuple[str, ...] = ()
+    """Bodies where limbs end; (): those of a body that is known. An MJCF's own must be named."""
+    clips: str = ""
+    """Path of an HDF5 file, name of a set in assets/clips, or cmu: two of a humanoid, 0.45 s."""
+    clip_set: str = "all"
+    """all, train, test (by their names), a behaviour, or one clip's name."""
+    held_out: float = 0.2
+    """About this share of the clips is `test`."""
+    allow: tuple[str, ...] = ()
+    """Joints that only one of body and clips has."""
+    control_rate: int = 100
+    """Control steps a second [Hz]."""
+    clip_rate: int = 50
+    """At which what is to come is told [Hz]: `control_rate` is it, or a multiple."""
+    substeps: int = 5
+    """Physics steps in one control step."""
+    window: int = 5
+    """Frames to come that are told, at `clip_rate`."""
+    start_frames: tuple[int, int] | None = None
+    """First and last frame, at `clip_rate`, in which episodes begin; None: any."""
+    start_noise: float = 0.02
+    """Half-width of the noise of each joint at the start [rad]."""
+    reward: tracking.Reward = tracking.Reward()
+    """Weights and scales of its terms."""
+    farthest_place: float = 0.1
+    """Of the torso from the recording's, beyond which the episode ends [m]."""
+    farthest_turn: float = 120.0
+    """The same of the whole angle between them, which is at most 180 [deg]."""
+    farthest_joints: float = 4.5
+    """The same of the root of the sum of squares over all joints [rad]."""
+
+    def __post_init__(self):
+        """Refuses rates, windows and starts that make no sense."""
+        if self.clip_rate < 1 or self.control_rate % self.clip_rate:
+            raise ValueError(
+                f"control_rate is {self.control_rate}, clip_rate {self.clip_rate}: "
+                "the first must be a whole multiple of the second."
+            )
+        if self.window < 1 or self.substeps < 1:
+            raise ValueError(f"window is {self.window}, substeps {self.substeps}; give 1 or more.")
+        if self.start_frames and not 0 <= self.start_frames[0] <= self.start_frames[1]:
+            raise ValueError(f"start_frames is {self.start_frames}; give 0 <= first <= last.")
+
+
+class Recording(NamedTuple):
+    """C clips of at most F frames, one for each control step."""
+
+    qpos: Array  # [C, F, nq]
+    qvel: Array  # [C, F, nv]
+    poses: Pose  # [C, F, ...]
+    lengths: Array  # [C] int32
+
+
+@dataclasses.dataclass(frozen=True)
+class Imitation:
+    """The environment; `build` makes one."""
+
+    options: Options
+    physics: Physics
+    parts: Parts
+    recording: Recording
+    names: tuple[str, ...]  # of the clips
+    action_size: int
+
+    @property
+    def control_timestep(self) -> float:
+        """Simulated time of one step [s]."""
+        return self.physics.control_timestep
+
+    @property
+    def stride(self) -> int:
+        """Control steps from one frame that is told to the next."""
+        return self.options.control_rate // self.options.clip_rate
+
+    @property
+    def ahead(self) -> int:
+        """Control steps from a frame to the last that is told with it."""
+        return self.stride * self.options.window
+
+    def reset(self, key: Array) -> State:
+        """Starts in a frame of a clip, with its velocities; each frame as often."""
+        clip_key, noise_key = jax.random.split(key)
+        clip, frame = self.draw_start(clip_key)
+        noise = self.options.start_noise
+        joints = jax.random.uniform(noise_key, (len(self.parts.qpos),), minval=-noise, maxval=noise)
+        qpos, qvel = self.recording.qpos[clip, frame], self.recording.qvel[clip, frame]
+        # Unique: a sum of terms that might meet would have no fixed order on a GPU.
+        qpos = qpos.at[np.array(self.parts.qpos)].add(joints, unique_indices=True)
+        physics, readings = self.physics.init(qpos, qvel)
+        action = jnp.zeros(self.action_size)
+        task = {"clip": clip, "start": frame, "frame": frame, "action": action}
+        return self._state(physics, readings, task, action)
+
+    def step(self, state: State, action: Array) -> State:
+        """Drives the actuators with action [A] in [-1, 1]; the clip goes on by a frame."""
+        ctrl = lookup.scale_action(self.physics.model, action)
+        physics, readings = self.physics.step(state.physics, ctrl)
+        task = state.task | {"frame": state.task["frame"] + 1}
+        return self._state(physics, readings, task, action)
+
+    def ghost(self, state: State) -> Array:
+        """Returns where the recording is, as qpos [nq], to be drawn beside the body."""
+        return self.recording.qpos[state.task["clip"], state.task["frame"]]
+
+    def draw_start(self, key: Array) -> tuple[Array, Array]:
+        """Draws a clip and a frame [] int32, with a window and one step after it."""
+        first, room = self.starts()
+        # By how many starts a clip has, so that none of them comes more often than another.
+        clip, frame = clips.draw(key, room, room, 1)
+        return clip, first + frame
+
+    def starts(self) -> tuple[int, Array]:
+        """Returns the first frame in which an episode may begin, and how many there are, [C]."""
+        first, last = self.options.start_frames or (0, len(self.recording.qpos[0]))
+        ends = jnp.minimum(self.recording.lengths - self.ahead - 1, last * self.stride + 1)
+        return first * self.stride, ends - first * self.stride
+
+    def _state(self, physics: PhysicsState, readings: Any, task: dict, action: Array) -> State:
+        options, parts = self.options, self.parts
+        now = pose_of(parts, physics, readings)
+        clip, frame = task["clip"], task["frame"]
+        reference = tracking.frames(self.recording.poses, clip, frame)
+        apart = tracking.errors(now, reference, np.array(parts.ends))
+        effort = Effort(action, task["action"], physics.qvel, readings.qfrc_actuator)
+        terms = tracking.reward_terms(options.reward, apart, now.place[2], effort)
+        failed = (
+            (apart["root_position"] > options.farthest_place)
+            | (apart["root_rotation"] > options.farthest_turn)
+            | (apart["joints"] > options.farthest_joints)
+        )
+        # Until here there is a whole window. The motion itself would go on, so what follows has a
+        # value, and that of a state like any other is known: it is truncated.
+        last = self.recording.lengths[clip] - 1 - self.ahead
+        first = (frame == task["start"] + 1).astype(jnp.float32)
+        metrics = {f"reward_{name}": term for name, term in terms.items()}
+        metrics |= tracking.readable(now, reference)
+        metrics |= {
+            "success_count": first - failed,  # of a whole episode: 1, or 0
+            "tracked_count": 1.0 / jnp.maximum(last - task["start"], 1),  # the share that it lasted
+        }
+        coming = frame + self.stride * (1 + np.arange(options.window))
+        told = tracking.targets(now, tracking.frames(self.recording.poses, clip, coming))
+        return State(
+            physics=physics,
+            observation={
+                "reference": told,
+                "proprioception": felt(parts, now, physics, readings, action),
+            },
+            reward=sum(terms.values(), jnp.zeros(())),
+            terminated=failed,
+            truncated=~failed & (frame >= last),
+            metrics=metrics | overflow_metric(readings),
+            task=task | {"action": action},
+        )
+
+
+def pose_of(parts: Parts, physics: PhysicsState, readings: Any) -> Pose:
+    """Returns how the body is."""
+    return Pose(
+        place=readings.xpos[parts.torso],
+        turn=readings.xquat[parts.torso],
+        joints=physics.qpos[np.array(parts.qpos)],
+        speeds=physics.qvel[np.array(parts.qvel)],
+        bodies=readings.xpos[np.array(parts.bodies)],
+    )
+
+
+def felt(parts: Parts, now: Pose, physics: PhysicsState, readings: Any, action: Array) -> Array:
+    """Returns what a body feels of itself, [P]: nothing of where it is, or which way it heads.
+
+    Angles and velocities of its joints, forces of its actuators, its height [m], which way is up,
+    where its limbs end as seen from the torso [m], its sensors, and the action before.
+    """
+    ends = now.bodies[np.array(parts.ends)] - now.place
+    told = [
+        now.joints,
+        now.speeds,
+        readings.qfrc_actuator[np.array(parts.dofs)],
+        now.place[2:],
+        readings.xmat[parts.torso][2],  # the world's z as the torso has it
+        tracking.into_frame(now.turn, ends).ravel(),
+    ]
+    if parts.sensors:
+        told.append(readings.sensordata[np.array(parts.sensors)])
+    if parts.free:  # MuJoCo keeps a free joint's rotation in the body's own frame
+        moving = physics.qvel[np.array(parts.free)]
+        told += [tracking.into_frame(now.turn, moving[:3]), moving[3:]]
+    return jnp.concatenate([*told, action])
+
+
+def record(parts: Parts, held: clips.Clips) -> Recording:
+    """Returns clips, a frame for each control step, as an environment holds them."""
+    places = [clips.kinematics(parts.model, np.asarray(track)) for track in held.qpos]
+    names = [parts.model.body(i).name.rpartition("/")[2] for i in (parts.torso, *parts.bodies)]
+    numbers = [places[0][0].index(name) for name in names]
+    where = jnp.asarray(np.stack([place[:, numbers] for _, place in places]), jnp.float32)
+    poses = Pose(
+        place=where[:, :, 0, :3],
+        turn=where[:, :, 0, 3:],
+        joints=held.qpos[..., np.array(parts.qpos)],
+        speeds=held.qvel[..., np.array(parts.qvel)],
+        bodies=where[:, :, 1:, :3],
+    )
+    return Recording(held.qpos, held.qvel, poses, held.lengths)
+
+
+def choose(options: Options, held: clips.Clips) -> clips.Clips:
+    """Returns the clips of the set that is asked for."""
+    if options.clip_set == "all":
+        return held
+    if options.clip_set in ("train", "test"):
+        return clips.split(held, options.held_out)[options.clip_set == "test"]
+    return clips.choose(held, options.clip_set)
+
+
+def build(options: Options = Options(), engine: str = "auto") -> Imitation:  # noqa: B008
+    """Builds the environment on an engine of `purerl.physics.interface`; reads its clips once."""
+    timestep = 1.0 / (options.control_rate * options.substeps)
+    parts = body_parts.find(options.body, options.end_effectors, engine, timestep)
+    motion = recordings.read(options.clips)
+    held = clips.fit(motion, parts.model, options.control_rate, options.allow)
+    held = choose(options, held)
+    readings = READINGS + (("sensordata",) if parts.sensors else ()) + overflow_reading(engine)
+    env = Imitation(
+        options=options,
+        physics=Physics(parts.model, readings, options.substeps, engine),
+        parts=parts,
+        recording=record(parts, held),
+        names=held.names,
+        action_size=parts.model.nu,
+    )
+    # A window, and a step after it, from the first frame that may begin an episode.
+    clips.check_window(held, env.starts()[0] + env.ahead + 2)
+    return env
