@@ -1,12 +1,13 @@
 """How a state looks: what of it is put into MuJoCo's model and scene before a picture is drawn.
 
 An environment that can be drawn has `physics: Physics`, and its states a PhysicsState as `physics`.
-It may have two methods:
+It may have three methods:
 
 - `model_changes(state) -> {field: array}`: the model fields of this episode, as its own `step`
   gives them to `Physics.step`. They are drawn as they were.
 - `scenery(state) -> (centers [P, 3], half_sizes [P, 3])` [m]: boxes that belong to the episode but
   are not all in the model at once, such as the far platforms of a corridor. Only drawn.
+- `ghost(state) -> qpos [nq]`: where the body ought to be. Only drawn, so that one sees through it.
 
 What its eyes see, the observation's entry "eyes" [E, H, W] uint8, is drawn beside it.
 
@@ -24,6 +25,8 @@ from purerl.core.errors import unknown_name
 from purerl.core.records import Array
 from purerl.physics.lookup import names
 
+GHOST = np.array([0.2, 0.6, 1.0, 0.3], np.float32)  # its color
+
 
 class Picture(NamedTuple):
     """All that decides how one state looks; leading axes are the caller's."""
@@ -34,6 +37,7 @@ class Picture(NamedTuple):
     changes: dict[str, Array]  # MjModel field -> its values
     scenery: tuple[Array, ...]  # () or centers and half sizes of boxes, [..., P, 3] each [m]
     eyes: tuple[Array, ...] = ()  # () or one array of what they see, [..., E, H, W] uint8
+    ghost: tuple[Array, ...] = ()  # () or the ghost's qpos, [..., nq]
 
 
 def take_picture(env: Any, state: State) -> Picture:
@@ -42,7 +46,8 @@ def take_picture(env: Any, state: State) -> Picture:
     scenery = env.scenery(state) if hasattr(env, "scenery") else ()
     p, seen = state.physics, state.observation
     eyes = (seen["eyes"],) if isinstance(seen, dict) and "eyes" in seen else ()
-    return Picture(p.qpos, p.mocap_pos, p.mocap_quat, changes, tuple(scenery), eyes)
+    ghost = (env.ghost(state),) if hasattr(env, "ghost") else ()
+    return Picture(p.qpos, p.mocap_pos, p.mocap_quat, changes, tuple(scenery), eyes, ghost)
 
 
 class Stage:
@@ -54,7 +59,7 @@ class Stage:
         # The compiler marks geoms that coincide with their body, and MuJoCo then never reads their
         # own place, so that a changed one would not show.
         model.geom_sameframe[:] = model.site_sameframe[:] = model.body_sameframe[:] = 0
-        self.data = mujoco.MjData(model)
+        self.data, self.ghost = mujoco.MjData(model), mujoco.MjData(model)
         self.fixed = find_camera(model, camera) if camera else default_camera(model)
         self.camera = mujoco.MjvCamera()
         self.root = root_body(model)
@@ -76,6 +81,8 @@ class Stage:
         self.data.mocap_quat[:] = picture.mocap_quat
 
         mujoco.mj_fwdPosition(self.model, self.data)
+        for self.ghost.qpos[:] in picture.ghost:
+            mujoco.mj_kinematics(self.model, self.ghost)
         if self.fixed is not None:
             self.camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
             self.camera.fixedcamid = self.fixed
@@ -110,6 +117,14 @@ def add_scenery(scene: mujoco.MjvScene, scenery: tuple[Array, ...]) -> None:
         # MuJoCo leaves these as they were in memory, and draws nothing for some of their values.
         geom.category, geom.transparent = int(mujoco.mjtCatBit.mjCAT_DECOR), 0
         scene.ngeom += 1
+
+
+def add_ghost(scene: mujoco.MjvScene, stage: Stage, option: mujoco.MjvOption) -> None:
+    """Adds the moving bodies of a stage's ghost to a scene, so that one sees through them."""
+    first, moving = scene.ngeom, mujoco.mjtCatBit.mjCAT_DYNAMIC.value
+    mujoco.mjv_addGeoms(stage.model, stage.ghost, option, mujoco.MjvPerturb(), moving, scene)
+    for geom in scene.geoms[first : scene.ngeom]:
+        geom.rgba[:], geom.matid, geom.transparent = GHOST, -1, 1
 
 
 def color_of(model: mujoco.MjModel, geom: int) -> np.ndarray:

@@ -9,6 +9,8 @@ import numpy as np
 
 from purerl.core.errors import UserError
 
+from purerl.physics import drawing
+
 # The last one is for rooms that may not import physics.
 from purerl.physics.drawing import Picture, Stage, add_scenery, color_of, root_body  # noqa: F401
 from purerl.report.opengl import open_gl
@@ -64,6 +66,8 @@ class Renderer(contextlib.AbstractContextManager):
             stage.model, stage.data, self.option, None, stage.camera, everything, self.scene
         )
         add_scenery(self.scene, picture.scenery)
+        if picture.ghost:
+            drawing.add_ghost(self.scene, stage, self.option)
         mujoco.mjr_render(self.size, self.scene, self.context)
         frame = np.empty((self.size.height, self.size.width, 3), np.uint8)
         mujoco.mjr_readPixels(frame, None, self.size, self.context)

@@ -38,7 +38,9 @@ class Scene:
         self.model, self.data = model, _ = self.stage.model, self.stage.data
         self.stage.pose(session.picture)
         self.batches = shapes.batches(model)
-        self.drawn = {n: shapes.layout(model, self.data, b) for n, b in self.batches.items()}
+        if session.picture.ghost:
+            self.batches |= shapes.ghosts(self.batches)
+        self.drawn = {name: self._layout(name) for name in self.batches}
         self.handles = {name: self._add_batch(name) for name in self.batches}
         for plane in shapes.planes(model):
             self.server.scene.add_grid(
@@ -60,14 +62,18 @@ class Scene:
         self.seen = session.picture
         self.stage.pose(session.picture)
         with self.server.atomic():
-            for name, batch in self.batches.items():
-                where = shapes.layout(self.model, self.data, batch)
+            for name in self.batches:
+                where = self._layout(name)
                 _send(self.handles[name], self.drawn[name], where)
                 self.drawn[name] = where
             self._draw_scenery(shapes.scenery_layout(session.picture))
             if self.follows:
                 self.offset = np.append(self.data.subtree_com[self.stage.root][:2], 0.0)
                 self.world.position = -self.offset
+
+    def _layout(self, name: str) -> shapes.Layout:
+        data = self.stage.ghost if name.startswith(shapes.GHOST) else self.data
+        return shapes.layout(self.model, data, self.batches[name])
 
     def _add_batch(self, name: str) -> Any:
         batch, where = self.batches[name], self.drawn[name]

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from purerl.report import episode_pictures, renderer
 
 SPHERE, ROD, BOX = "sphere", "rod", "box"
+GHOST = "ghost/"  # before the names of its batches
 _GEOM = mujoco.mjtGeom
 _PARTS = {  # a capsule is a rod and two spheres: it cannot be stretched as a whole
     int(_GEOM.mjGEOM_SPHERE): (SPHERE,),
@@ -73,6 +74,21 @@ def batches(model: mujoco.MjModel) -> dict[str, Batch]:
             batch = Batch(_mesh(model, name), name, geoms, sides, colors, opacities, moving)
             found[f"{'body' if moving else 'ground'}/{name}"] = batch
     return found
+
+
+def ghosts(body: dict[str, Batch]) -> dict[str, Batch]:
+    """Returns the moving batches of `batches` as a ghost's: no mouse can draw at them."""
+    rgba = renderer.drawing.GHOST
+    color, opacity = (255 * rgba[:3]).astype(np.uint8), rgba[3]
+    return {
+        GHOST + name: batch._replace(
+            colors=np.tile(color, (len(batch.geoms), 1)),
+            opacities=np.full_like(batch.opacities, opacity),
+            moving=False,
+        )
+        for name, batch in body.items()
+        if batch.moving
+    }
 
 
 def layout(model: mujoco.MjModel, data: mujoco.MjData, batch: Batch) -> Layout:
