@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 
 from purerl.core.errors import UserError
-
 from purerl.physics import drawing
 
 # The last one is for rooms that may not import physics.

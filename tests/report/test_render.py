@@ -261,6 +261,22 @@ def test_scenery_shows_and_is_forgotten():
     assert reddish(hidden).sum() == 0
 
 
+@pytest.mark.usefixtures("opengl")
+def test_a_ghost_shows_beside_the_body_and_one_sees_through_it():
+    model, where = room(), np.array([0.8, 0, 1, 1, 0, 0, 0], float)
+    with drawing.Renderer(model, 160, 120) as renderer:
+        plain = renderer.draw(picture(model))
+        haunted = renderer.draw(picture(model)._replace(ghost=(where,)))
+        near = np.array([0, -0.15, 1, 1, 0, 0, 0])
+        before = renderer.draw(picture(model)._replace(ghost=(near,)))
+        assert (renderer.draw(picture(model)) == plain).all()
+    changed = (haunted != plain).any(-1)
+    assert changed.sum() > 50 and np.nonzero(changed)[1].min() > 85  # to the right of the body
+    assert (haunted[reddish(plain)] == plain[reddish(plain)]).mean() > 0.9
+    bluer = before[..., 2].astype(int) - plain[..., 2]
+    assert bluer[reddish(plain)].mean() > 10 and before[reddish(plain)][:, 0].mean() > 60
+
+
 def test_furniture_is_not_what_the_camera_follows():
     shelf = "<body name='shelf'><geom size='1'/><body><geom size='1'/></body></body>"
     robot = "<body name='robot'><freejoint/><geom size='.1'/></body>"

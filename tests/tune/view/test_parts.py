@@ -165,6 +165,21 @@ def test_an_episodes_own_boxes_are_where_its_physics_has_them():
     assert [float(each.scales[1, 0]) for each in drawn] == [np.float32(0.9), np.float32(0.4)]
 
 
+def test_a_ghost_is_where_it_ought_to_be_and_cannot_be_drawn_at():
+    floor = '<geom type="box" size="1 1 0.1"/>'
+    stage = Stage(model_of(f'{floor}<body><freejoint/><geom size="0.1"/></body>'))
+    where = stage.model.qpos0 + np.array([2.0, 0, 0, 0, 0, 0, 0])
+    still = np.zeros((0, 3)), np.zeros((0, 4)), {}, (), ()
+    stage.pose(Picture(stage.model.qpos0, *still, (where,)))
+    body = shapes.batches(stage.model)
+    found = shapes.ghosts(body)
+    assert set(body) == {"ground/box", "body/sphere"} and set(found) == {"ghost/body/sphere"}
+    ghost = found["ghost/body/sphere"]
+    assert not ghost.moving and (ghost.opacities < 0.5).all()
+    assert shapes.layout(stage.model, stage.ghost, ghost).positions[0, 0] == 2.0
+    assert shapes.layout(stage.model, stage.data, body["body/sphere"]).positions[0, 0] == 0.0
+
+
 def test_a_mesh_and_a_hidden_geom():
     xml = """<mujoco><asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset><worldbody>
       <geom type="mesh" mesh="m"/><geom size="1" group="4"/><geom size="1" rgba="0 0 0 0"/>
