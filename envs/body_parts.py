@@ -102,14 +102,14 @@ def _parts(
     if balls := [i for i in joints if model.jnt_type[i] == BALL]:
         name = model.joint(balls[0]).name
         raise UserError(f"Joint {name!r} is a ball: what is compared are hinges and slides.")
-    sensors, kinds = [], []
+    sensors, kinds = list[int](), set[int]()
     for kind in FELT:
         for i in np.flatnonzero(model.sensor_type == kind):
             if model.body_rootid[model.site_bodyid[model.sensor_objid[i]]] == root:
                 sensors += range(model.sensor_adr[i], model.sensor_adr[i] + model.sensor_dim[i])
-                kinds.append(kind)
+                kinds.add(kind)
     free = [i for i in joints if model.jnt_type[i] == FREE]
-    told = set(_MOTION) <= set(kinds)
+    told = set(_MOTION) <= kinds
     dofs = [i for i in range(model.nv) if model.body_rootid[model.dof_bodyid[i]] == root]
     return Parts(
         model=model,

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from purerl import Array
 
@@ -118,7 +119,7 @@ def norm(x: Array) -> Array:
     return jnp.sqrt(jnp.square(x).sum())
 
 
-def errors(now: Pose, reference: Pose, ends: Array) -> dict[str, Array]:
+def errors(now: Pose, reference: Pose, ends: np.ndarray) -> dict[str, Array]:
     """Returns how far a body is from a frame, [] each, in the units of `Reward`.
 
     Args:

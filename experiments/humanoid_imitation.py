@@ -48,12 +48,14 @@ experiment = Experiment(
     ),
     build_network=build_network,
     network=networks.MlpOptions(
-        policy_hidden=(256, 256), value_hidden=(256, 256), initial_std=0.2, min_std=1e-3
+        policy_hidden=(256, 256), value_hidden=(256, 256), initial_std=0.3, min_std=1e-3
     ),
     ppo=Config(
-        num_steps=1_000_000,
+        num_steps=1_200_000,
         num_minibatches=8,
         gamma=0.97,
+        schedule="adaptive_kl",
+        desired_kl=0.02,
         episode_length=250,  # 5 s
         learning_rate=3e-4,
         entropy_weight=0.0,
