@@ -94,23 +94,15 @@ def _parts(
     limbs = [_body(model, prefix + name) for name in ends]
     root = int(model.body_rootid[limbs[0]])
     trunk = lookup.find(model, "body", prefix + torso) if torso else root
-    named = [_body(model, prefix + name) for name in names]
     own = [i for i in range(trunk, model.nbody) if model.body_rootid[i] == root]
-    bodies = list(dict.fromkeys([*(named or own), *limbs]))
+    bodies = list(dict.fromkeys([*([_body(model, prefix + n) for n in names] or own), *limbs]))
     joints = [i for i in range(model.njnt) if model.body_rootid[model.jnt_bodyid[i]] == root]
-    hinges = [i for i in joints if model.jnt_type[i] not in (FREE, BALL)]
     if balls := [i for i in joints if model.jnt_type[i] == BALL]:
         name = model.joint(balls[0]).name
         raise UserError(f"Joint {name!r} is a ball: what is compared are hinges and slides.")
-    sensors, kinds = list[int](), set[int]()
-    for kind in FELT:
-        for i in np.flatnonzero(model.sensor_type == kind):
-            if model.body_rootid[model.site_bodyid[model.sensor_objid[i]]] == root:
-                sensors += range(model.sensor_adr[i], model.sensor_adr[i] + model.sensor_dim[i])
-                kinds.add(kind)
-    free = [i for i in joints if model.jnt_type[i] == FREE]
-    told = set(_MOTION) <= kinds
-    dofs = [i for i in range(model.nv) if model.body_rootid[model.dof_bodyid[i]] == root]
+    hinges = [i for i in joints if model.jnt_type[i] != FREE]
+    dofs = np.flatnonzero(model.body_rootid[model.dof_bodyid] == root)
+    sensors, moves = _sensors(model, root)
     return Parts(
         model=model,
         torso=trunk,
@@ -118,12 +110,21 @@ def _parts(
         ends=tuple(bodies.index(i) for i in limbs),
         qpos=tuple(model.jnt_qposadr[hinges].tolist()),
         qvel=tuple(model.jnt_dofadr[hinges].tolist()),
-        dofs=tuple(dofs),
-        sensors=tuple(sensors),
-        free=()
-        if told or not free
-        else tuple(range(model.jnt_dofadr[free[0]], model.jnt_dofadr[free[0]] + 6)),
+        dofs=tuple(dofs.tolist()),
+        sensors=sensors,
+        free=tuple(dofs[:6].tolist()) if len(hinges) < len(joints) and not moves else (),
     )
+
+
+def _sensors(model: mujoco.MjModel, root: int) -> tuple[tuple[int, ...], bool]:
+    """Returns where a body's sensors stand in sensordata, and whether they tell how it moves."""
+    places, kinds = list[int](), set[int]()
+    for kind in FELT:
+        for i in np.flatnonzero(model.sensor_type == kind):
+            if model.body_rootid[model.site_bodyid[model.sensor_objid[i]]] == root:
+                places += range(model.sensor_adr[i], model.sensor_adr[i] + model.sensor_dim[i])
+                kinds.add(kind)
+    return tuple(places), set(_MOTION) <= kinds
 
 
 def _body(model: mujoco.MjModel, name: str) -> int:

@@ -83,7 +83,8 @@ class Recording(NamedTuple):
 
     qpos: Array  # [C, F, nq]
     qvel: Array  # [C, F, nv]
-    poses: Pose  # [C, F, ...]
+    torso: Array  # [C, F, 7] where it is [m], and its turn
+    bodies: Array  # [C, F, B, 3] [m]
     lengths: Array  # [C] int32
 
 
@@ -155,7 +156,7 @@ class Imitation:
         options, parts = self.options, self.parts
         now = pose_of(parts, physics, readings)
         clip, frame = task["clip"], task["frame"]
-        reference = tracking.frames(self.recording.poses, clip, frame)
+        reference = frames(parts, self.recording, clip, frame)
         apart = tracking.errors(now, reference, np.array(parts.ends))
         effort = Effort(action, task["action"], physics.qvel, readings.qfrc_actuator)
         terms = tracking.reward_terms(options.reward, apart, now.place[2], effort)
@@ -175,7 +176,7 @@ class Imitation:
             "tracked_count": 1.0 / jnp.maximum(last - task["start"], 1),  # the share that it lasted
         }
         coming = frame + self.stride * (1 + np.arange(options.window))
-        told = tracking.targets(now, tracking.frames(self.recording.poses, clip, coming))
+        told = tracking.targets(now, frames(parts, self.recording, clip, coming))
         return State(
             physics=physics,
             observation={
@@ -204,8 +205,9 @@ def pose_of(parts: Parts, physics: PhysicsState, readings: Any) -> Pose:
 def felt(parts: Parts, now: Pose, physics: PhysicsState, readings: Any, action: Array) -> Array:
     """Returns what a body feels of itself, [P]: nothing of where it is, or which way it heads.
 
-    Angles and velocities of its joints, forces of its actuators, its height [m], which way is up,
-    where its limbs end as seen from the torso [m], its sensors, and the action before.
+    Angles and velocities of its joints, forces of its actuators (a free joint's six zeros too, as
+    track-mjx lays a rodent's out), its height [m], which way is up, where its limbs end as seen
+    from the torso [m], its sensors, and the action before.
     """
     ends = now.bodies[np.array(parts.ends)] - now.place
     told = [
@@ -230,14 +232,19 @@ def record(parts: Parts, held: clips.Clips) -> Recording:
     names = [parts.model.body(i).name.rpartition("/")[2] for i in (parts.torso, *parts.bodies)]
     numbers = [places[0][0].index(name) for name in names]
     where = jnp.asarray(np.stack([place[:, numbers] for _, place in places]), jnp.float32)
-    poses = Pose(
-        place=where[:, :, 0, :3],
-        turn=where[:, :, 0, 3:],
-        joints=held.qpos[..., np.array(parts.qpos)],
-        speeds=held.qvel[..., np.array(parts.qvel)],
-        bodies=where[:, :, 1:, :3],
+    return Recording(held.qpos, held.qvel, where[:, :, 0], where[:, :, 1:, :3], held.lengths)
+
+
+def frames(parts: Parts, recording: Recording, clip: Array, frame: Any) -> Pose:
+    """Returns some frames [...] of a clip []."""
+    torso = recording.torso[clip, frame]
+    return Pose(
+        place=torso[..., :3],
+        turn=torso[..., 3:],
+        joints=recording.qpos[clip, frame][..., np.array(parts.qpos)],
+        speeds=recording.qvel[clip, frame][..., np.array(parts.qvel)],
+        bodies=recording.bodies[clip, frame],
     )
-    return Recording(held.qpos, held.qvel, poses, held.lengths)
 
 
 def choose(options: Options, held: clips.Clips) -> clips.Clips:

@@ -7,7 +7,6 @@ body's own frame, so that it does not depend on where the recording is or which 
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -196,8 +195,3 @@ def targets(now: Pose, coming: Pose) -> Array:
         into_frame(now.turn, coming.bodies - now.bodies).reshape(len(turn), -1),
     )
     return jnp.concatenate(parts, axis=-1).ravel()
-
-
-def frames(recording: Pose, clip: Array, frame: Array) -> Pose:
-    """Returns some frames [...] of a clip [], of a recording [C, F, ...]."""
-    return jax.tree.map(lambda x: x[clip, frame], recording)

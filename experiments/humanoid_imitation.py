@@ -48,14 +48,15 @@ experiment = Experiment(
     ),
     build_network=build_network,
     network=networks.MlpOptions(
-        policy_hidden=(256, 256), value_hidden=(256, 256), initial_std=0.3, min_std=1e-3
+        policy_hidden=(256, 256), value_hidden=(256, 256), initial_std=0.5, min_std=1e-3
     ),
     ppo=Config(
         num_steps=1_200_000,
-        num_minibatches=8,
-        gamma=0.97,
-        schedule="adaptive_kl",
-        desired_kl=0.02,
+        # An action of 0 is the middle of each joint's range, far from a stance. How far the policy
+        # moves in an update is limited, in its own scale: so small updates, and a large scale.
+        rollout_length=32,
+        num_minibatches=4,
+        gamma=0.95,
         episode_length=250,  # 5 s
         learning_rate=3e-4,
         entropy_weight=0.0,
