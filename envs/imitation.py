@@ -13,11 +13,14 @@ import numpy as np
 
 from purerl import (
     Array,
+    Network,
     Physics,
     PhysicsState,
+    PyTree,
     State,
     clips,
     lookup,
+    networks,
     overflow_metric,
     overflow_reading,
 )
@@ -254,6 +257,21 @@ def choose(options: Options, held: clips.Clips) -> clips.Clips:
     if options.clip_set in ("train", "test"):
         return clips.split(held, options.held_out)[options.clip_set == "test"]
     return clips.choose(held, options.clip_set)
+
+
+def joined(observation: dict[str, Array]) -> Array:
+    """Returns what a body is to do and what it feels as one array [..., O]."""
+    return jnp.concatenate([observation["reference"], observation["proprioception"]], axis=-1)
+
+
+def mlp(options: networks.MlpOptions, observation: PyTree, action_size: int) -> Network:
+    """Builds the default network, whose policy and value function read all of the observation."""
+    network = networks.mlp(options, joined(observation), action_size)
+
+    def apply(params: PyTree, observation: PyTree, memory: PyTree) -> tuple:
+        return network.apply(params, joined(observation), memory)
+
+    return network._replace(apply=apply)
 
 
 def build(options: Options = Options(), engine: str = "auto") -> Imitation:  # noqa: B008

@@ -1,29 +1,15 @@
-r"""dm_control's humanoid moves as a person did, from any frame of a recording.
+r"""dm_control's humanoid squats and swings its arms, as a computed clip does.
 
 python -m purerl.run humanoid_imitation
+
+Expected: after 7 min on two CPU cores (29 November 2026, one seed) it keeps up for 2.1 s of 5 s,
+its joints 7.5 deg from the clip's (after 0.5 min 0.7 s, 14 deg), and still gains. `--env.clips cmu`
+has dm_control's own recordings instead: 0.45 s of a fall.
 """
 
-import jax.numpy as jnp
-
-from purerl import Array, Config, Evaluation, Experiment, Network, PyTree, networks
+from purerl import Config, Evaluation, Experiment, networks
 from purerl.envs import imitation
 from purerl.envs.tracking import Reward, Term
-
-
-def joined(observation: dict[str, Array]) -> Array:
-    """Returns what a body is to do and what it feels as one array [..., O]."""
-    return jnp.concatenate([observation["reference"], observation["proprioception"]], axis=-1)
-
-
-def build_network(options: networks.MlpOptions, observation: PyTree, action_size: int) -> Network:
-    """Builds the default network, whose policy and value function read all of the observation."""
-    network = networks.mlp(options, joined(observation), action_size)
-
-    def apply(params: PyTree, observation: PyTree, memory: PyTree) -> tuple:
-        return network.apply(params, joined(observation), memory)
-
-    return network._replace(apply=apply)
-
 
 experiment = Experiment(
     build_env=imitation.build,
@@ -46,7 +32,7 @@ experiment = Experiment(
             energy_weight=0.0,
         ),
     ),
-    build_network=build_network,
+    build_network=imitation.mlp,
     network=networks.MlpOptions(
         policy_hidden=(256, 256), value_hidden=(256, 256), initial_std=0.5, min_std=1e-3
     ),
