@@ -57,7 +57,8 @@ def __getattr__(name: str) -> Any:
     if home == __name__:
         return importlib.import_module(f"{home}.{name}")
     # As `from home import name` does: what is no name of the module may be a module in it.
-    return globals().setdefault(name, getattr(__import__(home, fromlist=[name]), name))
+    found = getattr(__import__(home, fromlist=[name]), name)
+    return globals().setdefault(name, found)
 
 
 def __dir__() -> list[str]:
@@ -69,7 +70,8 @@ def what_to_write(name: str) -> str:
     import difflib
 
     known = {public.lower(): public for public in __all__}
-    if near := difflib.get_close_matches(name.lower(), known, n=1, cutoff=0.7):
+    near = difflib.get_close_matches(name.lower(), known, n=1, cutoff=0.7)
+    if near:
         return f"write `from purerl import {known[near[0]]}`"
     return f"the names to import from purerl are {', '.join(__all__)}"
 

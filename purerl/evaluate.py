@@ -32,7 +32,8 @@ def command(options: EvaluateOptions) -> None:
     """Evaluates, prints the figures, and writes the file that was asked for."""
     from purerl.runs.loaded_run import load
 
-    if (file := options.json) is not None:
+    file = options.json
+    if file is not None:
         files.check_writable(file)
     run = load(options.run, options.checkpoint, options.engine, options.trust)
     result = run.evaluate(options.episodes, options.seed, options.stochastic)

@@ -57,7 +57,8 @@ def make(options: RenderOptions) -> list[str]:
 
 def _parse_size(size: str) -> tuple[int, int]:
     """Returns (width, height) [pixels] of "640x480"."""
-    if (parts := re.fullmatch(r"(\d+)x(\d+)", size.lower())) is None:
+    parts = re.fullmatch(r"(\d+)x(\d+)", size.lower())
+    if parts is None:
         raise UserError(f"size is {size!r}; give width x height in pixels, such as 640x480.")
     width, height = map(int, parts.groups())
     if width % 2 or height % 2 or not 16 <= min(width, height) <= max(width, height) <= 4096:

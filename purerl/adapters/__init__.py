@@ -25,7 +25,8 @@ def __getattr__(name: str) -> Any:
     try:
         return _get(name)
     except ModuleNotFoundError as error:
-        if (extra := _EXTRAS.get((error.name or "").partition(".")[0])) is None:
+        extra = _EXTRAS.get((error.name or "").partition(".")[0])
+        if extra is None:
             raise
         line = purerl.how_to_install(extra)
         raise ImportError(f"adapters.{name} needs {error.name}: {line}") from error

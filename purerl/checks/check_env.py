@@ -151,7 +151,8 @@ def check_fields(state: Any) -> None:
             raise EnvError(
                 f"{name} is {_describe(value)}: it must be an array [] of {jnp.dtype(dtype).name}."
             )
-    if not (leaves := jax.tree_util.tree_leaves_with_path(state.observation)):
+    leaves = jax.tree_util.tree_leaves_with_path(state.observation)
+    if not leaves:
         raise EnvError("observation is empty: it must hold at least one float32 array.")
     for path, leaf in leaves:
         if len(path) > 1:

@@ -125,7 +125,8 @@ def _lines(closed: core.ClosedJaxpr) -> Iterator[tuple[Line, core.JaxprEqn | Non
 
 
 def _content(x: Any) -> Constant:
-    value = np.asarray(jax.random.key_data(x) if isinstance(x, jax.Array) and is_key(x) else x)
+    is_typed_key = isinstance(x, jax.Array) and is_key(x)
+    value = np.asarray(jax.random.key_data(x) if is_typed_key else x)
     text = str(value.item()) if value.size == 1 else f"an array {list(value.shape)}"
     return Constant(text, hashlib.sha256(value.tobytes()).hexdigest())
 

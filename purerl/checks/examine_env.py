@@ -31,7 +31,8 @@ def examine(env: Env, num_steps: int = NUM_STEPS) -> Iterator[Finding]:
         yield error("protocol", one_line(broken))
         return
     yield ok("protocol", "names, shapes and dtypes")
-    if changed := sorted(n for n, x in held.items() if before.get(n, env) is not x):
+    changed = sorted(n for n, x in held.items() if before.get(n, env) is not x)
+    if changed:
         what = f"reset or step sets env.{changed[0]}, and a compiled program does so only once"
         yield error("own state", f"{what}: what an episode must remember goes into State.task.")
     try:
@@ -68,7 +69,8 @@ def first_state(start: State) -> list[Finding]:
     """
     if np.ndim(start.reward) > 1:
         start = jax.tree.map(lambda x: x[0], start)
-    found = [check_keys(start)] if np.shape(start.reward)[0] > 1 else []
+    size = np.shape(start.reward)[0]
+    found = [check_keys(start)] if size > 1 else []
     found += _ended(np.asarray(start.terminated))
     return [one for one in found if one.level != "ok"]
 
@@ -202,7 +204,8 @@ def check_actions(trial: check_env.Trial) -> Finding:
     same = jax.tree.map(lambda x: jnp.repeat(x[:1], number, 0), trial.start)
     flips = np.ones((number, size), np.float32)
     flips[1 + np.arange(size), np.arange(size)] = -1.0
-    states = trial.rollout(same, jnp.repeat(trial.actions[:, :1], number, 1) * flips)[1]
+    actions = jnp.repeat(trial.actions[:, :1], number, 1) * flips
+    states = trial.rollout(same, actions)[1]
     # Not the reward, which may just take the action's cost.
     later = flatten((states.physics, states.observation, states.terminated)).values()
     acts = [(x[:, 1:] != x[:, :1]).any((0, *range(2, x.ndim)))[:size] for x in later]

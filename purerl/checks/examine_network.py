@@ -108,7 +108,8 @@ def _check_inputs(of_value: PyTree, of_policy: PyTree) -> Iterator[Finding]:
         for name, tree in (("value", of_value), ("policy", of_policy))
     }
     entries = list(flatten(of_value))
-    if blind := [k for k in entries if k not in reads["value"]]:
+    blind = [k for k in entries if k not in reads["value"]]
+    if blind:
         yield warning("inputs", f"the value does not depend on {_observations(blind)}.")
     own = [k for k in entries if k in ("", "policy")]
     if own and own[0] not in reads["policy"]:
@@ -132,9 +133,11 @@ def _check_parameters(gradients: PyTree, moved: PyTree, rates: PyTree) -> Findin
     Those of rate 0 shall be: they are frozen.
     """
     found, later, rates = (flatten(trained(tree)) for tree in (gradients, moved, rates))
-    if broken := [name for name, x in found.items() if _bad(x)]:
+    broken = [name for name, x in found.items() if _bad(x)]
+    if broken:
         return error("gradients", f"of {some(broken)} are not finite.")
-    if idle := [name for name, x in later.items() if not x.any() and rates[name].any()]:
+    idle = [name for name, x in later.items() if not x.any() and rates[name].any()]
+    if idle:
         what = "has none: it is" if len(idle) == 1 else "have none: they are"
         return warning("gradients", f"{some(idle)} {what} never trained.")
     return ok("gradients", f"each of {len(found)} parameters has one")

@@ -147,7 +147,8 @@ def _find_zeros(physics: Any, begun: Begun) -> Iterator[Finding]:
 def _find_moved(begun: Begun) -> Iterator[Finding]:
     """Finds parts of the state that reset changes after init."""
     names = ("mocap_pos", "mocap_quat", "qpos", "qvel", "act")
-    if moved := [n for n in names if (getattr(begun.before, n) != getattr(begun.after, n)).any()]:
+    moved = [n for n in names if (getattr(begun.before, n) != getattr(begun.after, n)).any()]
+    if moved:
         cure = f"the {moved[0]} that init is given"
         if moved[0].startswith("mocap"):
             cure = f'init\'s changes={{"body_{moved[0].removeprefix("mocap_")}": ...}}'
@@ -235,7 +236,8 @@ def check_solver(env: Any, trial: Trial) -> Iterator[Finding]:
 
     def after(model: Any) -> np.ndarray:
         step = Physics(model, (), physics.substeps, "c").step
-        return np.asarray(jax.jit(jax.vmap(jax.vmap(lambda given: step(**given)[0].qpos)))(calls))
+        batch = jax.vmap(jax.vmap(lambda given: step(**given)[0].qpos))
+        return np.asarray(jax.jit(batch)(calls))
 
     physics, first = env.physics, lambda state, action: step_calls(env, state, action)[0][1]
     solved, opt = copy.copy(physics.model), physics.model.opt

@@ -30,7 +30,8 @@ def hash_held(env: Env, network: Network) -> dict[str, str]:
         one, other, third = jax.random.split(key, 3)
         state, (params, memory) = env.step(env.reset(one), action), network.init(other)
         given = (state.observation, memory) + ((network.draw(third),) if network.draw else ())
-        return state, network.apply(params, *jax.tree.map(lambda x: x[None], given))
+        batch = jax.tree.map(lambda x: x[None], given)
+        return state, network.apply(params, *batch)
 
     traced = jax.make_jaxpr(call_all)(jax.random.key(0), jnp.zeros(env.action_size, jnp.float32))
     held = {id(x): x for x in constants(traced)}  # each array once

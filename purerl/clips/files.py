@@ -106,7 +106,8 @@ def _read_flat(path: Path, file: Any, frames: int) -> Motion:
     qpos = get("qpos", 2)
     names = tuple(map(str, config.get("model", {}).get("snips_order", ())))
     frames = frames or config.get("stac", {}).get("n_frames_per_clip", 0)
-    if not (frames := frames or len(qpos) // max(1, len(names)) * bool(names)):
+    frames = frames or len(qpos) // max(1, len(names)) * bool(names)
+    if not frames:
         raise UserError(f"{path} does not say how long its clips are: give it, as --frames 250.")
     number = len(qpos) // frames
     if number * frames != len(qpos) or len(names) not in (0, number):

@@ -24,7 +24,8 @@ def size(tree: PyTree) -> int:
 
 def room() -> int:
     """Returns the bytes of memory of a device: of a GPU its own, of a CPU the machine's."""
-    return (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit") or of_machine()
+    known = jax.local_devices()[0].memory_stats() or {}
+    return known.get("bytes_limit") or of_machine()
 
 
 def of_machine() -> int:
@@ -34,7 +35,8 @@ def of_machine() -> int:
 
 def least(config: Config, abstract: PyTree, action_size: int) -> dict[str, int]:
     """Returns what a run's parts take at least [bytes], of one seed on one device."""
-    sample = size(abstract.env_state.observation) / config.num_envs + 4 * (action_size + SCALARS)
+    number = config.num_envs
+    sample = size(abstract.env_state.observation) / number + 4 * (action_size + SCALARS)
     # An update has the rollouts as they were collected, and shuffled for the minibatches.
     rollouts = 2 * math.ceil(sample * config.steps_per_update)
     learned = size((abstract.params, abstract.optimizer))

@@ -127,7 +127,8 @@ def fetch(layout: Layout, state: Spread) -> TrainState:
     groups = [state.places[i : i + local] for i in range(0, len(state.places), local)]
     places = assemble(layout, SPLIT, [join(group) for group in groups])
     device = layout.here[0][0]
-    return on(device, state.learned).replace(**on(device, gather_all(layout.mesh)(places)))
+    everywhere = gather_all(layout.mesh)(places)
+    return on(device, state.learned).replace(**on(device, everywhere))
 
 
 # --- programs ---

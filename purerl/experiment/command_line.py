@@ -218,7 +218,8 @@ def _one_line(text: str, names: list[str], base: Any) -> str:
     """Returns tyro's framed, coloured message as one line: what is wrong, and the nearest fix."""
     text = re.sub(r"\x1b\[[0-9;]*m", "", text)
     plain = " ".join(re.sub(r"[─-╿]|-{5,}", " ", text).split())
-    if unknown := re.search(r"Unrecognized options: (\S+?)[,=]? ", plain):
+    unknown = re.search(r"Unrecognized options: (\S+?)[,=]? ", plain)
+    if unknown:
         if unknown[1] in ("True", "False"):
             return "A switch takes no value: give its option alone, or leave it out."
         if unknown[1] in names:  # a bool that is true: what turns it off is its only option

@@ -67,7 +67,8 @@ def with_parts(
 
     # No gradient: Adam's moments stay 0, and the norm by which gradients are clipped is the rest's.
     def apply(params: PyTree, *given: PyTree) -> tuple[PolicyOutput, PyTree]:
-        moving = map_named(lambda path, x: x if rate(path) else jax.lax.stop_gradient(x), params)
+        stop = jax.lax.stop_gradient
+        moving = map_named(lambda path, x: x if rate(path) else stop(x), params)
         return network.apply(moving, *given)
 
     held = tuple(entry for part in parts.values() for entry in part.reads or ())

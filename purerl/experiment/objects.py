@@ -273,7 +273,8 @@ def naming_broken_rules(env: Env) -> Iterator[None]:
 
 def physics_hash(env: Env) -> str | None:
     """Returns a sha256 of the model that an environment simulates; None if it has no `physics`."""
-    if (model := getattr(getattr(env, "physics", None), "model", None)) is None:
+    model = getattr(getattr(env, "physics", None), "model", None)
+    if model is None:
         return None
     from purerl.physics.lookup import hash_model
 

@@ -148,7 +148,8 @@ def _package(module: str) -> str:
 
 def _is_within(package: str, folders: set[Path]) -> bool:
     """Tells whether a package is in one of the folders, or nowhere."""
-    if (file := module_file(package)) is not None:
+    file = module_file(package)
+    if file is not None:
         return not folders.isdisjoint(file.parents)
     spec = importlib.util.find_spec(package) if package != "__main__" else None
     places = (spec and spec.submodule_search_locations) or []  # of a package without __init__.py

@@ -69,7 +69,8 @@ def _enter_cylinder(o: Vector, d: Vector, length: Array) -> Array:
     x, y = o[0] + t * d[0], o[1] + t * d[1]
     lid = _ahead(t, (jnp.abs(o[2]) > length) & (x * x + y * y <= 1.0))
     t, hit = _round(o[:2], d[:2])
-    return jnp.minimum(_ahead(t, hit & (jnp.abs(o[2] + t * d[2]) <= length)), lid)
+    side = hit & (jnp.abs(o[2] + t * d[2]) <= length)
+    return jnp.minimum(_ahead(t, side), lid)
 
 
 def _slabs(o: Vector, d: Vector, top: Array | float) -> tuple[Array, Array]:

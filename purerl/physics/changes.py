@@ -206,7 +206,8 @@ def _refusals(
         )
     if name == "geom_size":
         yield model.geom_fluid[:, 0] > 0, "would be unknown to a fluid: remove its fluidshape."
-    if behind := {n: rows for n, rows in follows(name).items() if n not in changes}:
+    behind = {n: rows for n, rows in follows(name).items() if n not in changes}
+    if behind:
         hand = " and ".join(n for n in behind if n in _COMPILED)
         yield (
             np.any(list(behind.values()), axis=0),

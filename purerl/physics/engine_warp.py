@@ -258,7 +258,8 @@ def _over_batch(function: Callable, axes: int = 0) -> Callable:
     @jax.custom_batching.custom_vmap
     def call(*args: PyTree) -> PyTree:
         lead = args[0].time.shape
-        flat = jax.tree.map(lambda x: x.reshape(math.prod(lead), *x.shape[axes:]), args)
+        number = math.prod(lead)
+        flat = jax.tree.map(lambda x: x.reshape(number, *x.shape[axes:]), args)
         return jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), function(*flat))
 
     @call.def_vmap

@@ -91,7 +91,8 @@ def scale_action(model: mujoco.MjModel, action: Array) -> Array:
       ValueError: an actuator has no ctrlrange, so that -1 and 1 mean nothing.
     """
     limited = model.actuator_ctrllimited
-    if open_ended := [n for n, ok in zip(names(model, "actuator"), limited, strict=True) if not ok]:
+    open_ended = [n for n, ok in zip(names(model, "actuator"), limited, strict=True) if not ok]
+    if open_ended:
         raise ValueError(
             f"Actuators without a ctrlrange: {', '.join(dict.fromkeys(open_ended))}. Give them "
             "one, so that an action in [-1, 1] has a meaning."

@@ -139,13 +139,15 @@ def room(model: mujoco.MjModel, put: mjw.Model) -> tuple[int, int]:
     each = put.nmaxpyramid if pyramidal else put.nmaxcondim
     # A weld has 6 rows. MJX-Warp drops an equality that would end where the buffer ends: 8 more.
     others = 6 * model.neq + model.nv + 2 * model.ntendon + model.njnt + 8
-    return contacts, min(contacts * max(1, int(each)) + others, MOST_ROWS)
+    rows = contacts * max(1, int(each)) + others
+    return contacts, min(rows, MOST_ROWS)
 
 
 def _points(types: np.ndarray) -> np.ndarray:
     """Returns how many points pairs of geoms, types [n, 2], can touch in at most, [n]."""
     one = np.isin(types, [int(g) for g in _ONE_POINT]).any(axis=1)
-    return np.where(one, 1, np.where((types == _GEOM.mjGEOM_CAPSULE).any(axis=1), 2, 8))
+    two = (types == _GEOM.mjGEOM_CAPSULE).any(axis=1)
+    return np.where(one, 1, np.where(two, 2, 8))
 
 
 def filled(shapes: Shapes) -> Shapes:

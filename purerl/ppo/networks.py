@@ -208,7 +208,8 @@ def recurrent(options: RecurrentOptions, observation: PyTree, action_size: int) 
       action_size: A.
     """
     check_observation(observation)
-    return from_linen(RecurrentActorCritic(options, action_size), observation, no_memory(options))
+    module = RecurrentActorCritic(options, action_size)
+    return from_linen(module, observation, no_memory(options))
 
 
 def no_memory(options: RecurrentOptions) -> PyTree:

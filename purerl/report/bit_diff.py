@@ -57,7 +57,8 @@ def _first_metrics_that_differ(a: RunRecord, b: RunRecord) -> list[str]:
     for line in a.lines:
         other = theirs.get(line["update"], line)
         names = [n for n in line if n in other and n not in ("wall_s", "digest")]
-        if differing := [n for n in names if line[n] != other[n]]:
+        differing = [n for n in names if line[n] != other[n]]
+        if differing:
             name = differing[0]
             return [
                 f"metrics part at update {line['update']}: {name} is {line[name]} and "
@@ -76,7 +77,8 @@ def _first_leaves_that_differ(a: RunRecord, b: RunRecord) -> tuple[str, list[str
         except checkpoint_folder.DamagedError as error:
             return f"leaves cannot be compared: a checkpoint of {update} is damaged: {error}", []
         every = sorted({*ours, *theirs})
-        if leaves := [leaf for leaf in every if ours.get(leaf) != theirs.get(leaf)]:
+        leaves = [leaf for leaf in every if ours.get(leaf) != theirs.get(leaf)]
+        if leaves:
             named = ", ".join(leaves[:SHOWN]) + (", ..." if len(leaves) > SHOWN else "")
             where = f"leaves differ in the checkpoint of update {update}, the first {named}"
             return f"{len(leaves)} of {len(every)} {where}", leaves

@@ -23,7 +23,8 @@ def choose_gl(find: Callable[[str], str | None] = ctypes.util.find_library) -> s
     Raises:
       RunError: there is no OpenGL; the message says what to install.
     """
-    if not (chosen := os.environ.get("MUJOCO_GL", "").lower()):
+    chosen = os.environ.get("MUJOCO_GL", "").lower()
+    if not chosen:
         if Path("/dev/nvidiactl").exists() and find("EGL_nvidia"):
             chosen = "egl"
         elif find("OSMesa"):

@@ -120,7 +120,8 @@ def _charts(sections: Sequence[tuple[str, list[page_series.Panel]]], several: bo
         wide = title == page_series.SECTIONS[0][0]
         drawn, still = [], []
         for panel in inside:
-            if (value := page_series.constant(panel)) is None:
+            value = page_series.constant(panel)
+            if value is None:
                 drawn.append(chart(panel, number, WIDE if wide else SMALL, several))
             else:
                 still.append(f"{panel.metric} = {short(value)}")

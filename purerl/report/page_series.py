@@ -54,7 +54,8 @@ def panels(groups: Sequence[seed_statistics.Group]) -> list[tuple[str, list[Pane
     found: dict[str, list[Panel]] = {title: [] for title, _ in SECTIONS}
     names.sort(key=lambda name: name != RETURN)  # evaluation's return first
     for name in names[:MOST_PANELS]:
-        if series := series_of(groups, name):
+        series = series_of(groups, name)
+        if series:
             found[section_of(name)].append(Panel(name, series))
     return [(title, inside) for title, inside in found.items() if inside]
 

@@ -93,7 +93,8 @@ def evaluations(runs: Sequence[RunRecord]) -> Html:
     """Returns every metric of each run's last evaluation; empty if there was none."""
     last = [next((x for x in reversed(run.lines) if RETURN in x), None) for run in runs]
     names = dict.fromkeys(name for line in last if line for name in line if name[:5] == "eval/")
-    if not (every := [n for n in FIRST if n in names] + sorted(names.keys() - FIRST)):
+    every = [n for n in FIRST if n in names] + sorted(names.keys() - FIRST)
+    if not every:
         return Html("")
     rows = [
         [run.path.name, f"{line['steps']:,}", *(_number(line.get(name)) for name in every)]

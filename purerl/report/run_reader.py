@@ -88,7 +88,8 @@ def find_runs(arguments: Iterable[Path]) -> list[Path]:
     found: list[Path] = []
     for argument in arguments:
         matches = [] if os.path.exists(argument) else sorted(map(Path, glob.glob(str(argument))))
-        if not (runs := [run for place in matches or [argument] for run in runs_in(place)]):
+        runs = [run for place in matches or [argument] for run in runs_in(place)]
+        if not runs:
             kind = "holds no run" if argument.is_dir() else "is no run, folder of runs or pattern"
             raise UserError(f"{argument} {kind}: no config.json is there.")
         found += runs

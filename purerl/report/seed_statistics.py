@@ -183,7 +183,8 @@ def learning_curve(group: Group, metric: str) -> Curve | None:
     curves = [curve for found in strata for curve in found]
     sound = [run.curve(metric) for runs in counted for run in runs if run.status != "failed"]
     steps = sorted(set.intersection(*map(set, sound or curves))) if curves else []
-    if not (steps := [step for step in steps if all(min(curve) <= step for curve in curves)]):
+    steps = [step for step in steps if all(min(curve) <= step for curve in curves)]
+    if not steps:
         return None
     values = [np.array([_carried_on(curve, steps) for curve in found]) for found in strata]
     return Curve(group.label, steps, bootstrap.curve_band(values), curves)

@@ -117,7 +117,8 @@ def renderer_of(env: Any, size: tuple[int, int], camera: str = "") -> Renderer:
 def draw(path: Path, renderer: Renderer, recording: Recording, timestep: float) -> None:
     """Writes the video of recorded episodes with steps of `timestep` [s], and a contact sheet."""
     stride, size = frame_stride(timestep), (renderer.size.width, renderer.size.height)
-    pictures = [episode_pictures(recording, i, stride) for i in range(len(recording.length))]
+    episodes = range(len(recording.length))
+    pictures = [episode_pictures(recording, i, stride) for i in episodes]
     frames = (frame for each in pictures for frame in renderer.draw_episode(each))
     _write_files(path, frames, sum(map(len, pictures)), size, 1.0 / (stride * timestep))
 

@@ -79,7 +79,8 @@ class MetricsFile:
         try:
             rest = self.pending
             while rest:  # after half of it, the rest meets the reason, such as a full disk
-                if not (written := self.file.write(rest)):
+                written = self.file.write(rest)
+                if not written:
                     raise OSError("nothing was written")
                 rest = rest[written:]
         except OSError:

@@ -77,7 +77,8 @@ def read_checkpoint(run: Folder, update: str, setup: Setup, say: Say) -> checkpo
         )
     folder, owners = run.checkpoints, manifest.owners(check_manifest(run))
     if update == "latest":
-        if not (whole := checkpoint.newest([folder], abstract, say, rename=False, owners=[owners])):
+        whole = checkpoint.newest([folder], abstract, say, rename=False, owners=[owners])
+        if not whole:
             raise UserError(f"{run.path} has no whole checkpoint yet.")
         return whole[0]
     path = find_checkpoint(run, update)

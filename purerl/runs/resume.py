@@ -68,7 +68,8 @@ def _check_usable(folder: Folder, chosen: Experiment, resume: options.Resume) ->
 def _how_to_begin(folder: Folder, chosen: Experiment) -> str:
     """Returns what to do where a run has the folder already; one of other settings cannot go on."""
     there = folder.config.get("settings", {})
-    if not (unlike := manifest.differences(there, settings_json.to_json(chosen))):
+    unlike = manifest.differences(there, settings_json.to_json(chosen))
+    if not unlike:
         return "; use --resume to go on, or another --name."
     if len(unlike) == 1 and unlike[0].startswith("ppo.num_steps"):
         return f" ({unlike[0]}); to train longer, copy it first (docs/howto/go_on.md)."
@@ -197,7 +198,8 @@ def _noted(folder: Folder, found: list[str]) -> dict[str, Any]:
     noted = with_change(old, max(folder.updates, default=0), found)
     if known["name"] != folder.path.name:
         noted["allowed_changes"][-1]["of"], known = known, _identity(folder)
-    return known | {name: old[name] for name in ("had_checkpoint",) if name in old} | noted
+    had = {name: old[name] for name in ("had_checkpoint",) if name in old}
+    return known | had | noted
 
 
 def with_change(facts: dict[str, Any], after: int, found: list[str]) -> dict[str, Any]:

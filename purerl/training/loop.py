@@ -182,7 +182,8 @@ def shown_record(records: Sequence[Record]) -> Record:
 
     The length is that of the seed with the longest.
     """
-    known = [value for value in [r["train/episode_return"] for r in records] if value is not None]
+    returns = [r["train/episode_return"] for r in records]
+    known = [value for value in returns if value is not None]
     return records[0] | {
         "train/episode_return": sum(known) / len(known) if known else None,
         "train/nonfinite_resets": sum(r["train/nonfinite_resets"] for r in records),
@@ -200,7 +201,8 @@ def _check_finite(
     seed that is lost cannot be saved.
     """
     reasons = [_why_lost(programs, state, records, seed) for seed in range(len(records))]
-    if (lost := next((seed for seed, reason in enumerate(reasons) if reason), None)) is None:
+    lost = next((seed for seed, reason in enumerate(reasons) if reason), None)
+    if lost is None:
         return
     for writer, record in zip(writers, records, strict=True):
         writer.write(record)

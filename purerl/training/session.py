@@ -179,7 +179,8 @@ def _write_down(
     """Writes what a run is, unless that is there already; returns what its folder holds then."""
     schedule = {"log_every": job.plan.log_every, "checkpoints": job.options.checkpoints}
     now = resume.Description(resume.describe_config(source, chosen, schedule), job.facts, source)
-    if (facts := resume.what_to_write(folder, now, job.options.allow_changes, begun)) is None:
+    facts = resume.what_to_write(folder, now, job.options.allow_changes, begun)
+    if facts is None:
         return folder
     checkpoint.check_fits(folder.checkpoints, folder.updates, job.abstract)
     if begun and folder.is_run:

@@ -93,7 +93,8 @@ def guide_of(config: Config, env: Env, network: Network, learned: TrainState | N
 
 def start(settings: Settings, env: Env, guide: Guide) -> Plan:
     """Returns the plan at the start of an episode: to do nothing, or what the guide does."""
-    return Plan(jnp.zeros((settings.knots, env.action_size)), guide.memory, jnp.zeros(()))
+    knots = jnp.zeros((settings.knots, env.action_size))
+    return Plan(knots, guide.memory, jnp.zeros(()))
 
 
 def plan(
@@ -127,7 +128,8 @@ def plan(
     around = (mean, jnp.full(mean.shape, settings.noise))
     (knots, _), values = jax.lax.scan(improve, around, jnp.arange(settings.iterations))
 
-    base, _, memory = guide.act(*jax.tree.map(lambda x: x[None], begin))
+    one = jax.tree.map(lambda x: x[None], begin)
+    base, _, memory = guide.act(*one)
     action = jnp.clip(base[0] + spline(settings, knots[None])[0, 0], -1.0, 1.0)
     return Plan(knots, jax.tree.map(lambda x: x[0], memory), values[-1]), action
 
@@ -158,7 +160,8 @@ def draw(settings: Settings, mean: Array, scale: Array, key: Array) -> Array:
     """
     spread = jnp.geomspace(*SPREAD, settings.samples)[:, None, None]
     noise = jax.random.normal(key, (settings.samples, *mean.shape)).at[0].set(0.0)
-    return jnp.clip(mean + spread * scale * noise, -1.0, 1.0).at[1].set(0.0)
+    samples = jnp.clip(mean + spread * scale * noise, -1.0, 1.0)
+    return samples.at[1].set(0.0)
 
 
 def play(

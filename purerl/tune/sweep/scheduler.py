@@ -148,7 +148,8 @@ def environment_of(slot: int, at_once: int, gpus: list[str]) -> dict[str, str]:
     if len(gpus) > 1:
         found["CUDA_VISIBLE_DEVICES"] = gpus[slot % len(gpus)]
     if gpus and at_once > len(gpus):  # JAX alone would take three quarters of its memory
-        found["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{0.9 / -(-at_once // len(gpus)):.2f}"
+        share = 0.9 / -(-at_once // len(gpus))
+        found["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{share:.2f}"
     return found
 
 

@@ -141,7 +141,8 @@ def _describe(sweep: Sweep) -> dict[str, Any]:
     for space in sweep.spaces:
         # Choices as they are read: `1e-4` is `0.0001`.
         values = [to_json(points.read_value(base, space.setting, text)) for text in space.choices]
-        swept[space.setting] = values or {"low": space.low, "high": space.high, "log": space.log}
+        ends = {"low": space.low, "high": space.high, "log": space.log}
+        swept[space.setting] = values or ends
     how = "random" if options.random else "optuna" if options.optuna else "grid"
     found = {"experiment": base.source.name, "settings": to_json(base.chosen), "swept": swept}
     found |= {"points": how, "seeds": options.seeds}

@@ -130,7 +130,8 @@ def play(
             pace.steps += max(1, session.length - before.length)
         if now - said > SAY:
             said, timestep = now, session.program.env.control_timestep
-            page.say(session, beside.words or pace.words(timestep), source.words(session.numbers))
+            doing = beside.words or pace.words(timestep)
+            page.say(session, doing, source.words(session.numbers))
         if now - looked > LOOK and page.checkpoints is not None:
             looked = now
             page.offer_checkpoints(source.checkpoints())

@@ -139,7 +139,8 @@ def _scales(shape: str, kinds: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Returns the sizes [N, 3] of unit meshes of a shape, which are parts of geoms."""
     radius, half = size[:, :1], size[:, 1:2]
     if shape == SPHERE:
-        return np.where((kinds == int(_GEOM.mjGEOM_ELLIPSOID))[:, None], size, radius)
+        ellipsoid = (kinds == int(_GEOM.mjGEOM_ELLIPSOID))[:, None]
+        return np.where(ellipsoid, size, radius)
     if shape == ROD:
         return np.concatenate([radius, radius, half], axis=1)
     return size if shape == BOX else np.ones_like(size)
