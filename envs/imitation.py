@@ -232,7 +232,7 @@ def felt(parts: Parts, now: Pose, physics: PhysicsState, readings: Any, action: 
 def record(parts: Parts, held: clips.Clips) -> Recording:
     """Returns clips, a frame for each control step, as an environment holds them."""
     places = [clips.kinematics(parts.model, np.asarray(track)) for track in held.qpos]
-    names = [parts.model.body(i).name.rpartition("/")[2] for i in (parts.torso, *parts.bodies)]
+    names = [clips.bare(parts.model.body(i).name) for i in (parts.torso, *parts.bodies)]
     numbers = [places[0][0].index(name) for name in names]
     where = jnp.asarray(np.stack([place[:, numbers] for _, place in places]), jnp.float32)
     return Recording(held.qpos, held.qvel, where[:, :, 0], where[:, :, 1:, :3], held.lengths)

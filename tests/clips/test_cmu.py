@@ -1,40 +1,17 @@
 """Motion of a person, as dm_control ships it, fitted to dm_control's humanoid."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 pytest.importorskip("h5py", reason="pip install -e '.[clips]'")
 
-import h5py
 import mujoco
-from dm_control.locomotion import mocap
 from dm_control.locomotion.arenas import floors
 from dm_control.locomotion.walkers import cmu_humanoid
 
 from purerl import clips
 from purerl.clips import examine
-
-FILE = Path(mocap.__file__).parent / "test_trajectories.h5"
-
-
-def motion_of(walker) -> clips.Motion:
-    """Returns dm_control's two trajectories of 10 frames, [values, T] each dataset, as Motion."""
-    joints = tuple(joint.name for joint in walker.mocap_joints)
-    bodies = tuple(body.name for body in walker.mocap_tracking_bodies)
-    with h5py.File(FILE) as file:
-        names, values, places = tuple(file), [], []
-        for name in names:
-            person = file[name]["walkers/walker_0"]
-            values.append(
-                np.vstack([person[key] for key in ("position", "quaternion", "joints")]).T
-            )
-            places.append(person["body_positions"][()].T.reshape(10, -1, 3))
-        rate = 1.0 / float(file[names[0]].attrs["dt"])
-    columns = ("root",) * 7 + joints
-    lengths = np.full(len(names), 10)
-    return clips.Motion(columns, np.stack(values), lengths, names, rate, bodies, np.stack(places))
+from purerl.envs import recordings
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +20,7 @@ def person():
     walker, arena = cmu_humanoid.CMUHumanoid(), floors.Floor()
     walker.create_root_joints(arena.attach(walker))
     xml, assets = arena.mjcf_model.to_xml_string(), arena.mjcf_model.get_assets()
-    return mujoco.MjModel.from_xml_string(xml, assets), motion_of(walker)
+    return mujoco.MjModel.from_xml_string(xml, assets), recordings.cmu()
 
 
 def test_a_person_is_where_the_file_says(person):
