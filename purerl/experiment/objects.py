@@ -113,6 +113,22 @@ def check_acts(chosen: Experiment, before: dict[str, Any], env: Env, abstract: P
         )
 
 
+def check_observation(env: Env, learned: PyTree) -> None:
+    """Raises UserError unless an environment's observation has the shapes that were learned from.
+
+    Args:
+      env: the environment, of other settings.
+      learned: an observation of the environment that a policy was trained in, or its shapes.
+    """
+    other = jax.eval_shape(env.reset, jax.random.key(0)).observation
+    given, wanted = (jax.tree.map(lambda x: list(x.shape), tree) for tree in (other, learned))
+    if given != wanted:
+        raise UserError(
+            f"These options make an observation {given}, and the policy was trained on {wanted}: "
+            "take them back, or train with them."
+        )
+
+
 def check_memory(setup: Setup, abstract: PyTree, seeds: int, devices: int) -> None:
     """Raises UserError, with the size to lower, if a run cannot fit into a device's memory.
 

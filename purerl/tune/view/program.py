@@ -19,6 +19,7 @@ from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.keys import Purpose, derive
 from purerl.core.records import Array, PyTree
 from purerl.devices.compilation import jit, start as compile_beside
+from purerl.experiment.objects import check_observation
 from purerl.ppo.episodes import is_lost
 from purerl.report import episode_pictures, renderer
 from purerl.tune.option_numbers import Place, numbers_of, replaced
@@ -87,7 +88,9 @@ def build_program(
     """
     try:
         env = build_env(options, engine)
-        _check(env, observed)
+        renderer.model_of(env)
+        if observed is not None:
+            check_observation(env, observed)
         every = numbers_of(options)
         live = find_live(lambda values: build_env(replaced(options, values), engine), every)
         names = tuple(live)
@@ -123,17 +126,6 @@ def build_program(
 
 def _on_host(moment: Moment, shown: Any) -> tuple[Moment, Any]:
     return moment, jax.device_get(shown)
-
-
-def _check(env: Any, observed: PyTree) -> None:
-    renderer.model_of(env)
-    given = jax.eval_shape(env.reset, jax.random.key(0)).observation
-    given, wanted = (jax.tree.map(lambda x: list(x.shape), tree) for tree in (given, observed))
-    if observed is not None and given != wanted:
-        raise UserError(
-            f"These options make an observation {given}, and the policy was trained on {wanted}: "
-            "take them back, or train with them."
-        )
 
 
 def find_live(build: Callable[[Numbers], Any], numbers: Numbers) -> dict[Place, int | float]:
