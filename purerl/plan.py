@@ -34,6 +34,7 @@ def command(words: Sequence[str]) -> None:
     from purerl.machine.files import write_answer
     from purerl.machine.signals import stop_signals
     from purerl.machine.state_arrays import digest_leaves, flatten
+    from purerl.report.comparison import episodes_csv
     from purerl.report.opengl import choose_gl
     from purerl.training.train import set_xla_flags_in_time
     from purerl.tune.plan import figures
@@ -66,7 +67,8 @@ def command(words: Sequence[str]) -> None:
     output.show(*titles(problems), *said)
     whole = {name: x.figures | x.judged for name, x in played.items()}
     if options.csv is not None:
-        write_answer(options.csv, figures.rows(whole))
+        each = [({"settings": name}, x) for name, x in whole.items()]
+        write_answer(options.csv, episodes_csv(each))
     if options.json is not None:
         about: dict[str, Any] = {"problem": first.name, "trained": first.trained}
         about["environments"] = {one.title: one.settings for one in problems}

@@ -2,7 +2,7 @@
 
 import contextlib
 import io
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -194,6 +194,20 @@ def _curve_rows(curves: Iterable[Curve]) -> Iterator[dict[str, Any]]:
         for i, steps in enumerate(curve.steps):
             band = {k: None if v is None else v[i] for k, v in curve.band._asdict().items()}
             yield {"group": curve.label, "n": len(curve.runs), "steps": steps} | band
+
+
+def episodes_csv(groups: Iterable[tuple[dict[str, Any], Mapping[str, Any]]]) -> bytes:
+    """Returns CSV: a row for each episode of each group.
+
+    Args:
+      groups: what stands in all rows of a group, and its figures, name -> [N].
+    """
+    rows = [
+        about | {"episode": i} | {name: float(x[i]) for name, x in figures.items()}
+        for about, figures in groups
+        for i in range(len(next(iter(figures.values()))))
+    ]
+    return as_csv(list(dict.fromkeys(name for row in rows for name in row)), rows)
 
 
 def plotter() -> Any:

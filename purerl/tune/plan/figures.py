@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from purerl.machine.files import as_csv
 from purerl.report import comparison
 from purerl.report.bootstrap import LEAST_RUNS, mean_interval
 from purerl.tune.plan.episodes import TERM
@@ -53,17 +52,6 @@ def said(values: np.ndarray | None) -> str:
     interval = mean_interval(values)
     known = "" if interval is None else f" [{interval.low:.4g}, {interval.high:.4g}]"
     return f"{values.mean():.4g}{known}"
-
-
-def rows(groups: Mapping[str, Figures]) -> bytes:
-    """Returns CSV: a row for each episode of each group."""
-    names = dict.fromkeys(name for figures in groups.values() for name in figures)
-    each = []
-    for group, figures in groups.items():
-        for episode in range(len(figures[LENGTH])):
-            values = {name: float(values[episode]) for name, values in figures.items()}
-            each.append({"settings": group, "episode": episode} | values)
-    return as_csv(["settings", "episode", *names], each)
 
 
 def as_json(groups: Mapping[str, Figures], about: Mapping[str, Any]) -> str:
