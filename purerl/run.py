@@ -63,7 +63,7 @@ def _train(words: Sequence[str]) -> None:
         from purerl.devices.processes import is_first
 
         if is_first():
-            shown = render.RenderOptions(folders[0], trust=True)
+            shown = render.RenderOptions(run=folders[0], trust=True)
             if file := _attempt("video", _show_policy, shown):
                 _attempt("video for the loggers", _log_video, options, folders[0], Path(file))
 

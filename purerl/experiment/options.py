@@ -1,7 +1,9 @@
 """Options of commands: how a run is made, kept and shown, and how its policy is played."""
 
+import math
+import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypedDict
 
@@ -11,6 +13,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 from purerl.core.errors import UserError, check_least
 
 Engine = Literal["auto", "c", "jax", "warp"]
+UNITS = r"all|\d+(-\d+)?(,\d+(-\d+)?)*"
 
 
 def check_seed(seed: int) -> None:
@@ -33,23 +36,63 @@ RESUME = PrimitiveConstructorSpec(
 
 
 @dataclass(frozen=True)
-class PlayOptions:
-    """Which run's policy is played, from which checkpoint, and where."""
+class EpisodeOptions:
+    """Which episodes are played, and from which checkpoint."""
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """The run's folder, such as runs/ant_run/seed1, or ant_gaps, which comes with purerl."""
     checkpoint: str = "latest"
-    """latest, best (highest evaluation return), or an update's number."""
+    """Of a run: latest, best (highest evaluation return), or an update's number."""
     seed: int = 0
-    """Seed of the episodes; never meets a seed of training."""
-    engine: Literal["", Engine] = ""
-    """Physics engine, where it should not be the run's own."""
+    """Seed of the episodes, and of all else that is drawn; never meets a seed of training."""
     trust: bool = False
     """Execute the run's experiment.py though this machine does not know it: read it first."""
 
     def __post_init__(self) -> None:
         """Checks the rules."""
         check_seed(self.seed)
+
+
+@dataclass(frozen=True)
+class PlayOptions(EpisodeOptions):
+    """Which run's policy is played, and where."""
+
+    run: Annotated[Path, tyro.conf.Positional] = field(kw_only=True)
+    """The run's folder, such as runs/ant_run/seed1, or ant_gaps, which comes with purerl."""
+    engine: Literal["", Engine] = ""
+    """Physics engine, where it should not be the run's own."""
+
+
+@dataclass(frozen=True)
+class Lesion:
+    """What is done to units of a network while it acts."""
+
+    layer: tuple[str, ...] = ()
+    """Layers, called as by `record` but for network/, such as policy/Dense_0; none: no lesion."""
+    kind: Literal["silence", "noise", "clamp"] = "silence"
+    """silence: activity times 1 - strength; noise: plus normal noise with the deviation strength;
+    clamp: the activity is strength."""
+    strength: float = 1.0
+    """How much, in the sense of kind."""
+    units: str = "all"
+    """Which of each layer's units, such as 0-15,20."""
+    share: float = 1.0
+    """Of these, drawn by --seed; a greater share has the units of a smaller one, and more."""
+    begin: int = 0
+    """The episode's first step with it."""
+    end: int | None = None
+    """The first step without it again; none: it lasts."""
+
+    def __post_init__(self) -> None:
+        """Checks the rules."""
+        most, end = (1.0 if self.kind == "silence" else math.inf), self.end or math.inf
+        rules = {
+            "units": (re.fullmatch(UNITS, self.units), "all, or numbers such as 0-15,20"),
+            "strength": (self.kind == "clamp" or 0.0 <= self.strength <= most, f"0 to {most:g}"),
+            "share": (0.0 <= self.share <= 1.0, "from 0 to 1"),
+            "begin": (0 <= self.begin < end, f"0 or more, and below end, {self.end}"),
+        }
+        for name, (holds, must) in rules.items():
+            if not holds:
+                raise UserError(f"{name} is {getattr(self, name)!r}; it must be {must}.")
 
 
 @dataclass(frozen=True)

@@ -13,20 +13,28 @@ from purerl.machine.state_arrays import Leaves, flatten
 from purerl.ppo import distributions, episodes, evaluation
 
 
-def note_modules(noted: dict[str, Array]) -> Callable[..., Any]:
-    """Returns an interceptor of Flax's calls that notes what each module returns, by its path."""
+def note_modules(
+    noted: dict[str, Array], change: Callable[[str, Array], Array] = lambda name, x: x
+) -> Callable[..., Any]:
+    """Returns an interceptor of Flax's calls that notes what each module returns, by its path.
+
+    What is noted, and goes on to the next module, is `change(name, array)`.
+    """
 
     def intercept(call: Callable, arguments: tuple, options: dict, context: Any) -> Any:
-        result = call(*arguments, **options)
-        path = "/".join(context.module.path)
-        if path and context.method_name == "__call__":
-            for part, array in jax.tree_util.tree_leaves_with_path(result):
-                name = jax.tree_util.keystr(part, simple=True, separator=".")
-                name = f"{path}.{name}" if part else path
-                while name in noted:
-                    name += "_again"  # one module, applied to several things
-                noted[name] = array
-        return result
+        result, path = call(*arguments, **options), "/".join(context.module.path)
+        if not path or context.method_name != "__call__":
+            return result
+
+        def note(part: Any, array: Array) -> Array:
+            name = jax.tree_util.keystr(part, simple=True, separator=".")
+            name = f"{path}.{name}" if part else path
+            while name in noted:
+                name += "_again"  # one module, applied to several things
+            noted[name] = change(name, array)
+            return noted[name]
+
+        return jax.tree_util.tree_map_with_path(note, result)
 
     return intercept
 

@@ -1,16 +1,17 @@
 """What is planned for or looked at: an experiment, or a run with what it has learned."""
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from purerl.checks import findings
 from purerl.core.errors import UserError
 from purerl.experiment import definition, loading
 from purerl.experiment.command_line import from_command_line, parse
-from purerl.experiment.options import check_seed
+from purerl.experiment.options import EpisodeOptions, PlayOptions
 from purerl.machine import output
+from purerl.report import run_reader, seed_statistics
 from purerl.runs import folder, loaded_run
 from purerl.tune.plan.settings import Settings
 
@@ -18,21 +19,13 @@ SETTABLE = ("env", "engine")  # of an experiment's settings
 
 
 @dataclass(frozen=True)
-class PlanOptions(Settings):
+class PlanOptions(EpisodeOptions, Settings):
     """How plans are made, and which episodes they are for."""
-
-    seed: int = 0
-    """Seed of the episodes and of the plans; episodes begin as those of `evaluate`, and never meet
-    a seed of training."""
-    checkpoint: str = "latest"
-    """Of a run: latest, best (highest evaluation return), or an update's number."""
-    trust: bool = False
-    """Execute the run's experiment.py though this machine does not know it: read it first."""
 
     def __post_init__(self) -> None:
         """Checks the rules."""
-        super().__post_init__()
-        check_seed(self.seed)
+        Settings.__post_init__(self)
+        EpisodeOptions.__post_init__(self)
 
 
 class Subject(NamedTuple):
@@ -52,7 +45,7 @@ def show_help(base: Any, about: str | None, prog: str, words: Sequence[str]) -> 
       prog: the command's own words.
       words: the command line.
     """
-    output.show(*str(about).split("\n"), f"Of the environment: {prog} EXPERIMENT --help", "")
+    output.show(*str(about).split("\n"), f"Of the environment: {prog} NAME --help", "")
     if words:
         parse(base, ["--help"], prog)
 
@@ -73,17 +66,31 @@ def find(words: Sequence[str], prog: str, policies: bool = False) -> Subject:
     name = words[0]
     if not (Path(name).is_dir() or policies and loading.shipped(name)):
         return Subject(name, loading.find_source(name), None)
-    # Options that say how to read the run, whose experiment says which other options there are.
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument("--checkpoint", default="latest")
-    parser.add_argument("--engine", default="")
-    parser.add_argument("--trust", action="store_true")
-    try:
-        known, _ = parser.parse_known_args(words[1:])
-    except argparse.ArgumentError as error:
-        raise UserError(f"The command line is wrong: {error}.") from error
+    # How to read the run, whose experiment says which other options there are.
+    here = [word for word in words if word not in ("-h", "--help")]
+    known, _ = parse(PlayOptions, here, prog, return_unknown_args=True)
     run = loaded_run.load(name, known.checkpoint, known.engine, known.trust)
     return Subject(name, loading.Source(run.experiment, name, run.folder / folder.CODE), run)
+
+
+def find_runs(words: Sequence[str], prog: str) -> tuple[Subject, dict[str, Any], list[str]]:
+    """Finds the runs that the words before the first option mean.
+
+    Returns:
+      The first one as a subject, name -> what `load` returned of each, and the other words.
+
+    Raises:
+      UserError: there are none, or they are not of one configuration.
+    """
+    number = next((i for i, word in enumerate(words) if word.startswith("-")), len(words))
+    places = [loading.shipped(word) or Path(word) for word in words[:number]]
+    records = run_reader.read_runs(places, prog.split(".")[-1])
+    if names := findings.some(list(seed_statistics.differing(records)), 3):
+        raise UserError(f"The runs differ in {names}; give runs that differ in their seed alone.")
+    found = [find([str(x.path), *words[number:]], prog) for x in records]
+    paths = [(Path(x.name), x.run) for x in found]
+    runs = {path.name if loading.is_shipped(path) else str(path): run for path, run in paths}
+    return found[0], runs, list(words[number:])
 
 
 def chosen(
