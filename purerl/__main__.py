@@ -11,8 +11,8 @@ from purerl.experiment.loading import summary
 from purerl.machine import command_errors, output
 
 COMMANDS = (
-    "new", "check", "run", "evaluate", "render", "view", "record", "export", "pack", "compare",
-    "report", "plot", "sweep", "plan", "clips",
+    "new", "check", "run", "evaluate", "ask", "render", "view", "record", "export", "pack",
+    "compare", "report", "plot", "sweep", "plan", "clips",
 )  # fmt: skip
 
 HERE = Path(__file__).parent

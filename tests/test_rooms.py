@@ -63,8 +63,8 @@ MAY_IMPORT = {
 LINKS = {"envs", "experiments", "assets"}
 # Files beside the rooms. The command `report` is the room of that name, by its __main__.py.
 COMMANDS = {
-    "check", "compare", "evaluate", "export", "new", "pack", "plan", "plot", "record", "render",
-    "run", "sweep", "view",
+    "ask", "check", "compare", "evaluate", "export", "new", "pack", "plan", "plot", "record",
+    "render", "run", "sweep", "view",
 }  # fmt: skip
 MODULES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path

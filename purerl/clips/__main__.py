@@ -55,9 +55,7 @@ def command(options: ClipsOptions) -> None:
     model = model_of(objects.build(loading.find(options.body)).env)
     clips = body.fit(motion, model, motion.rate, options.allow)
     if options.cut:
-        if options.out.exists():
-            raise UserError(f"{options.out} is there: name another file, as -o part.h5.")
-        files.check_writable(options.out)
+        files.check_new(options.out)
         clip_files.write(options.out, records.cut(clips, *options.cut), model)
         output.show(str(options.out))
     if options.draw:

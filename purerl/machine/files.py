@@ -196,6 +196,13 @@ def check_writable(path: Path) -> None:
         raise UserError(f"{path} cannot be written: is {place} a folder of yours?")
 
 
+def check_new(path: Path) -> None:
+    """Raises UserError if a file that a person has named is there, or could not be written."""
+    if path.is_file():
+        raise UserError(f"{path} is there: name another file, or take that one away.")
+    check_writable(path)
+
+
 def make_folder(path: Path) -> None:
     """Makes a folder, and those above it that are missing."""
     missing = [place for place in (path, *path.parents) if not place.exists()]

@@ -99,6 +99,19 @@ def mean_interval(values: Values) -> Interval | None:
     return _interval(lambda strata: strata[0].mean(axis=-1), [values])
 
 
+def episode_interval(values: Values) -> Interval | None:
+    """Returns the interval of the mean over episodes, [n]; None for too few.
+
+    Of what is 0 or 1 it is Wilson's: where all episodes agree, a bootstrap would have no width.
+    """
+    if len(values) < LEAST_RUNS or not np.isin(values, (0, 1)).all():
+        return mean_interval(values)
+    from scipy.stats import binomtest  # most of a second
+
+    found = binomtest(int(values.sum()), len(values)).proportion_ci(LEVEL, "wilson")
+    return Interval(found.low, found.high)
+
+
 def iqm_interval(strata: Sequence[Values]) -> Interval | None:
     """Returns the stratified bootstrap interval of the IQM; None for too few runs."""
     return _interval(pooled_iqm, strata)

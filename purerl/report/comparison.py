@@ -10,7 +10,7 @@ from purerl.core.errors import UserError
 from purerl.machine.files import as_csv, write_file, write_json, writing
 from purerl.machine.output import printable
 from purerl.report import bit_diff, run_reader, seed_statistics
-from purerl.report.bootstrap import LEAST_IQM, LEAST_RUNS, center_name
+from purerl.report.bootstrap import LEAST_IQM, LEAST_RUNS, Interval, center_name
 from purerl.report.seed_statistics import Curve
 from purerl.runs import manifest
 
@@ -161,8 +161,9 @@ def cell(value: Any) -> str:
     """Returns a number with four significant digits (whole where it is large), or [low, high]."""
     if value is None:
         return "-"
-    if isinstance(value, dict):
-        return f"[{cell(value['low'])}, {cell(value['high'])}]"
+    if isinstance(value, dict | Interval):
+        low, high = value.values() if isinstance(value, dict) else value
+        return f"[{cell(low)}, {cell(high)}]"
     if isinstance(value, float):
         return f"{value:,.0f}" if abs(value) >= 10_000 else f"{value:.4g}"
     return str(value)
