@@ -1,8 +1,9 @@
 """Records episodes as arrays in one file: `python -m purerl.record RUN [--out episodes.npz]`.
 
-They begin as those of `python -m purerl.evaluate RUN` with the same options. Another program
-computes them, so the last bits differ, and a body with contacts goes its own way in the end: count
-returns from `reward` here. Every array but `length` is [N, T, ...]: N episodes of at most T steps.
+Any option of the environment can be given, and a lesion. Without these the episodes begin as those
+of `python -m purerl.evaluate RUN` with the same options. Another program computes them, so the last
+bits differ, and a body with contacts goes its own way in the end: count returns from `reward` here.
+Every array but `length` is [N, T, ...]: N episodes of at most T steps.
 
     length [N]          steps of the episode; what comes after them is no part of it
     observation         before the step, as the environment gives it (the network gets it
@@ -22,40 +23,74 @@ returns from `reward` here. Every array but `length` is [N, T, ...]: N episodes 
 MuJoCo's model, to compute from `qpos` where limbs are, is `purerl.load(RUN).env.physics.model`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from purerl.core.errors import UserError, check_least
-from purerl.experiment.command_line import main_of
-from purerl.experiment.options import PlayOptions
+from purerl.experiment.command_line import main_of_words
+from purerl.experiment.options import EpisodeOptions, Lesion
 from purerl.machine import command_errors, files
 from purerl.machine.output import show
+from purerl.tune import subject
+
+PROG = "python -m purerl.record"
 
 
 @dataclass(frozen=True)
-class RecordOptions(PlayOptions):  # noqa: D101 (--help prints the page above)
-    __doc__ = __doc__
+class RecordOptions(EpisodeOptions):
+    """What is recorded, and where it is written."""
 
     out: Path = Path("episodes.npz")
-    """File to write."""
+    """File to write: arrays, or HDF5 with names and where the body's parts are if it ends in .h5"""
+    clips: bool = False
+    """Write the motion alone, as clips in HDF5."""
     episodes: int = 8
     """Whole episodes, N."""
+    lesion: Lesion = Lesion()
 
 
-def command(options: RecordOptions) -> None:
+def command(words: Sequence[str]) -> None:
     """Writes the file and tells what is in it."""
-    from purerl.report.episode_arrays import record
-    from purerl.runs.loaded_run import load
+    from purerl.report import asking, episode_arrays, lesions
 
+    found, runs, words = subject.find_runs(words, PROG)
+    if len(runs) > 1:
+        raise UserError(f"{len(runs)} runs are given; record one at a time.")
+    experiment, options = subject.chosen(found, words, PROG, RecordOptions)
     check_least(options, UserError, episodes=1)
     files.check_writable(options.out)
-    run = load(options.run, options.checkpoint, options.engine, options.trust)
-    arrays = record(run.restored.setup, run.state, options.seed, options.episodes)
-    files.write_arrays(options.out, arrays)
+    if options.clips or options.out.suffix == ".h5":
+        command_errors.check_installed("h5py", "clips")
+    ((name, run),) = runs.items()
+    setup = asking.setup_of(experiment, run)
+    setup, state, _ = lesions.lesioned(setup, run.state, options.lesion, options.seed)
+    arrays = episode_arrays.record(setup, state, options.seed, options.episodes)
+    write(options, arrays, setup.env, {"run": name, "digest": run.digest})
     show(*(f"{name:32} {x.dtype} {list(x.shape)}" for name, x in arrays.items()), str(options.out))
 
 
-main = main_of(RecordOptions, command, "python -m purerl.record")
+def write(options: RecordOptions, arrays: dict[str, Any], env: Any, about: dict[str, str]) -> None:
+    """Writes what was recorded, in the layout that was asked for."""
+    if options.clips:
+        from purerl.clips import body, files as clip_files
+        from purerl.report.renderer import model_of
+
+        model = model_of(env)
+        both = zip(arrays["physics/qpos"], arrays["length"], strict=True)
+        tracks = {f"Episode_{i}": x[:length] for i, (x, length) in enumerate(both) if length}
+        packed = body.pack(model, [*tracks.values()], [*tracks], 1.0 / env.control_timestep)
+        clip_files.write(options.out, packed, model)
+    elif options.out.suffix == ".h5":
+        from purerl.clips import episodes
+
+        episodes.write(options.out, arrays, env, **about)
+    else:
+        files.write_arrays(options.out, arrays)
+
+
+main = main_of_words(command, lambda words: subject.show_help(RecordOptions, __doc__, PROG, words))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 May import: core, physics, machine, experiment, report. Read: `records.py`, then `files.py` and
 `body.py`: what a file holds, and how it becomes a body's. `sampling.py` is what an environment
-calls. docs/howto/clips.md shows all of it.
+calls; `episodes.py` writes what `record` recorded. docs/howto/clips.md shows all of it.
 """
 
 import purerl

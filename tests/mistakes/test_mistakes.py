@@ -12,7 +12,7 @@ from purerl.devices import memory
 from tests.mistakes.play import Mistake, agree, make, prepare, read_table
 
 TABLE = read_table()
-NEED_A_RUN = ("a run", "no onnx", "MUJOCO_GL=glfw", "an unknown run")
+NEED_A_RUN = ("a run", "no onnx", "no h5py", "MUJOCO_GL=glfw", "an unknown run")
 
 
 @pytest.fixture(scope="session")

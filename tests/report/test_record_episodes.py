@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
-from purerl import evaluate, record, run
+from purerl import clips, evaluate, load, record, run
 from purerl.core.errors import USAGE
 from purerl.ppo import running_moments
 from purerl.ppo.networks import GaussianHead, PolicyOptions
@@ -114,6 +115,62 @@ def test_a_memory_is_what_the_step_before_left(lstm):
         np.testing.assert_allclose(memory[:, 1:], left, rtol=1e-6, atol=1e-7)
 
 
+def test_hdf5_has_each_array_where_it_is_looked_for_and_names_its_axes(mlp, tmp_path):
+    h5py = pytest.importorskip("h5py", reason="pip install -e '.[clips]'")
+    file, arrays = tmp_path / "out.h5", mlp.arrays | {"length": np.array([30, 7, 0])}
+    env = load(mlp.folder).env
+    record.write(record.RecordOptions(out=file), arrays, env, {"run": "mine"})
+    with h5py.File(file) as found:
+        assert found["metadata"].attrs["run"] == "mine"
+        steps = found["episodes/1/timesteps"]
+        assert dict(steps.parent.attrs)["n_steps"] == 7
+        places = {"physics/qpos": "qpos", "action": "action", "metrics/upright": "metrics/upright"}
+        places |= {"observation": "observations/policy", "physics/time": "time"}
+        places |= {f"network/policy{x}": f"activations/policy{x or '/__call__'}"
+                   for x in ("", "/Dense_0")}  # fmt: skip
+        for name, at in places.items():
+            np.testing.assert_array_equal(steps[at], arrays[name][1, :7])
+        assert steps["done"][:].tolist() == [0] * 6 + [1]
+        named = [steps[name].dims[1][0].asstr()[:].tolist() for name in ("qpos", "action")]
+        assert named == [["slide", "hinge"], ["push"]]
+        arrays_of_steps = []
+        steps.visititems(lambda n, x: arrays_of_steps.append(x) if hasattr(x, "dims") else None)
+        for x in arrays_of_steps:
+            if x.name.endswith("/time"):
+                assert x.is_scale and x.attrs["units"] == "s"
+            else:
+                assert x.dims[0][0] == steps["time"]
+                assert [len(dim[0]) for dim in x.dims] == list(x.shape), x.name
+        model, data = env.physics.model, mujoco.MjData(env.physics.model)
+        data.qpos[:] = arrays["physics/qpos"][1, 5]
+        mujoco.mj_kinematics(model, data)
+        pole, turned = (steps[f"world/pole_{name}"][5] for name in ("xpos", "xmat"))
+        np.testing.assert_allclose(pole, data.body("pole").xpos, atol=1e-6)
+        np.testing.assert_allclose(turned, data.body("pole").xmat.reshape(3, 3), atol=1e-6)
+        assert found["episodes/2/timesteps/qpos"].shape == (0, 2)
+
+
+def test_hdf5_opens_in_xarray(mlp, tmp_path):
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip("h5netcdf")
+    file = tmp_path / "out.h5"
+    record.write(record.RecordOptions(out=file), mlp.arrays, load(mlp.folder).env, {})
+    with xarray.open_datatree(file, engine="h5netcdf") as tree:
+        steps = tree["episodes/0/timesteps"]
+        assert steps["qpos"].dims == ("time", "qpos_layout")
+        hinge = steps["qpos"].sel(qpos_layout="hinge")
+        np.testing.assert_array_equal(hinge, mlp.arrays["physics/qpos"][0, :, 1])
+
+
+def test_episodes_as_clips(mlp, tmp_path):
+    pytest.importorskip("h5py", reason="pip install -e '.[clips]'")
+    file, arrays = tmp_path / "out.h5", mlp.arrays | {"length": np.array([30, 7, 9])}
+    record.write(record.RecordOptions(out=file, clips=True), arrays, load(mlp.folder).env, {})
+    motion = clips.read(file)
+    assert motion.lengths.tolist() == [30, 7, 9] and motion.rate == pytest.approx(50.0)
+    np.testing.assert_array_equal(motion.values[1, :7], arrays["physics/qpos"][1, :7])
+
+
 @pytest.mark.parametrize(("steps", "length", "ends"), [(4, 4, True), (12, 10, False)])
 def test_an_end_before_the_time_limit_is_told_from_the_limit(tmp_path, steps, length, ends):
     runs, out = tmp_path / "runs", tmp_path / "out.npz"
@@ -150,6 +207,7 @@ def test_a_module_that_is_applied_twice_is_noted_twice():
         (["--out", "/nowhere/x.npz"], "/nowhere/x.npz cannot be written"),
         (["--out", "/tmp"], "/tmp cannot be written"),
         (["--out", "/dev/full", "--episodes", "1"], "/dev/full cannot be written: No space left"),
+        (["--lesion.kind", "noise"], "The lesion has no layer: add --lesion.layer"),
         (["--checkpoint", "77"], "There is no checkpoint '77'"),
     ],
 )
