@@ -151,8 +151,8 @@ def test_hdf5_has_each_array_where_it_is_looked_for_and_names_its_axes(mlp, tmp_
 
 
 def test_hdf5_opens_in_xarray(mlp, tmp_path):
-    xarray = pytest.importorskip("xarray")
-    pytest.importorskip("h5netcdf")
+    import xarray
+
     file = tmp_path / "out.h5"
     record.write(record.RecordOptions(out=file), mlp.arrays, load(mlp.folder).env, {})
     with xarray.open_datatree(file, engine="h5netcdf") as tree:
