@@ -1,15 +1,16 @@
 """Which parts of a body are compared with a recording: of dm_control's walkers, or of any MJCF."""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
-from purerl import UserError, lookup
+from purerl import PhysicsState, UserError, lookup
 from purerl.envs.arenas import Floor
 from purerl.envs.bodies import ANT, HUMANOID, RODENT
 from purerl.envs.compose import PREFIX, compose
+from purerl.envs.tracking import Pose
 
 BODIES = {"ant": ANT, "rodent": RODENT, "humanoid": HUMANOID}
 HEADS = {"rodent": ("skull",), "humanoid": ("head",)}  # limbs too
@@ -64,11 +65,8 @@ def find(body: str, ends: tuple[str, ...], engine: str, timestep: float) -> Part
       UserError: there is no such body or file, or it is none that can be compared.
     """
     if body in BODIES:
-        known, heads = BODIES[body], HEADS.get(body, ())
-        sensors = SENSORS[body]
-        model = compose(known, Floor(), engine, timestep, sensors=sensors).model
-        names = COMPARED.get(body, ())
-        return _parts(model, ends or (*known.end_effectors, *heads), names, known.torso, PREFIX)
+        composed = compose(BODIES[body], Floor(), engine, timestep, sensors=SENSORS[body])
+        return of_model(composed.model, body, ends)
     if not body.endswith(".xml"):
         there = ", ".join(sorted(BODIES))
         raise UserError(f"body is {body!r}: give the path of an MJCF file (.xml), or {there}.")
@@ -77,6 +75,29 @@ def find(body: str, ends: tuple[str, ...], engine: str, timestep: float) -> Part
     model = _compiled(Path(body))
     model.opt.timestep = timestep
     return _parts(model, ends)
+
+
+def of_model(model: mujoco.MjModel, body: str, ends: tuple[str, ...] = ()) -> Parts:
+    """Looks up the parts of a body that is known, composed with its `SENSORS`, in any arena."""
+    known, heads = BODIES[body], HEADS.get(body, ())
+    limbs = ends or (*known.end_effectors, *heads)
+    return _parts(model, limbs, COMPARED.get(body, ()), known.torso, PREFIX)
+
+
+def readings(parts: Parts) -> tuple[str, ...]:
+    """Returns what `pose_of` and `feeling.proprioception` read."""
+    return ("xpos", "xquat", "xmat", "qfrc_actuator") + ("sensordata",) * bool(parts.sensors)
+
+
+def pose_of(parts: Parts, physics: PhysicsState, readings: Any) -> Pose:
+    """Returns how the body is."""
+    return Pose(
+        place=readings.xpos[parts.torso],
+        turn=readings.xquat[parts.torso],
+        joints=physics.qpos[np.array(parts.qpos)],
+        speeds=physics.qvel[np.array(parts.qvel)],
+        bodies=readings.xpos[np.array(parts.bodies)],
+    )
 
 
 def _compiled(path: Path) -> mujoco.MjModel:

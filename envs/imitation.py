@@ -26,9 +26,8 @@ from purerl import (
 )
 from purerl.envs import body_parts, recordings, tracking
 from purerl.envs.body_parts import Parts
+from purerl.envs.feeling import proprioception
 from purerl.envs.tracking import Effort, Pose
-
-READINGS = ("xpos", "xquat", "xmat", "qfrc_actuator")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +39,8 @@ class Options:
     end_effectors: tuple[str, ...] = ()
     """Bodies where limbs end; (): those of a body that is known. An MJCF's own must be named."""
     clips: str = ""
-    """Path of an HDF5 file, name of a set in assets/clips, or cmu: two of a humanoid, 0.45 s."""
+    """Path of an HDF5 file; rodent: twenty that come with purerl; cmu: two of a humanoid, 0.45 s;
+    squats: a computed one of it."""
     clip_set: str = "all"
     """all, train, test (by their names), a behaviour, or one clip's name."""
     held_out: float = 0.2
@@ -157,7 +157,7 @@ class Imitation:
 
     def _state(self, physics: PhysicsState, readings: Any, task: dict, action: Array) -> State:
         options, parts = self.options, self.parts
-        now = pose_of(parts, physics, readings)
+        now = body_parts.pose_of(parts, physics, readings)
         clip, frame = task["clip"], task["frame"]
         reference = frames(parts, self.recording, clip, frame)
         apart = tracking.errors(now, reference, np.array(parts.ends))
@@ -184,7 +184,7 @@ class Imitation:
             physics=physics,
             observation={
                 "reference": told,
-                "proprioception": felt(parts, now, physics, readings, action),
+                "proprioception": proprioception(parts, now, physics, readings, action),
             },
             reward=sum(terms.values(), jnp.zeros(())),
             terminated=failed,
@@ -192,41 +192,6 @@ class Imitation:
             metrics=metrics | overflow_metric(readings),
             task=task | {"action": action},
         )
-
-
-def pose_of(parts: Parts, physics: PhysicsState, readings: Any) -> Pose:
-    """Returns how the body is."""
-    return Pose(
-        place=readings.xpos[parts.torso],
-        turn=readings.xquat[parts.torso],
-        joints=physics.qpos[np.array(parts.qpos)],
-        speeds=physics.qvel[np.array(parts.qvel)],
-        bodies=readings.xpos[np.array(parts.bodies)],
-    )
-
-
-def felt(parts: Parts, now: Pose, physics: PhysicsState, readings: Any, action: Array) -> Array:
-    """Returns what a body feels of itself, [P]: nothing of where it is, or which way it heads.
-
-    Angles and velocities of its joints, forces of its actuators (a free joint's six zeros too, as
-    track-mjx lays a rodent's out), its height [m], which way is up, where its limbs end as seen
-    from the torso [m], its sensors, and the action before.
-    """
-    ends = now.bodies[np.array(parts.ends)] - now.place
-    told = [
-        now.joints,
-        now.speeds,
-        readings.qfrc_actuator[np.array(parts.dofs)],
-        now.place[2:],
-        readings.xmat[parts.torso][2],  # the world's z as the torso has it
-        tracking.into_frame(now.turn, ends).ravel(),
-    ]
-    if parts.sensors:
-        told.append(readings.sensordata[np.array(parts.sensors)])
-    if parts.free:  # MuJoCo keeps a free joint's rotation in the body's own frame
-        moving = physics.qvel[np.array(parts.free)]
-        told += [tracking.into_frame(now.turn, moving[:3]), moving[3:]]
-    return jnp.concatenate([*told, action])
 
 
 def record(parts: Parts, held: clips.Clips) -> Recording:
@@ -281,7 +246,7 @@ def build(options: Options = Options(), engine: str = "auto") -> Imitation:  # n
     motion = recordings.read(options.clips)
     held = clips.fit(motion, parts.model, options.control_rate, options.allow)
     held = choose(options, held)
-    readings = READINGS + (("sensordata",) if parts.sensors else ()) + overflow_reading(engine)
+    readings = body_parts.readings(parts) + overflow_reading(engine)
     env = Imitation(
         options=options,
         physics=Physics(parts.model, readings, options.substeps, engine),

@@ -21,7 +21,7 @@ from purerl import (
     overflow_metric,
     overflow_reading,
 )
-from purerl.envs import sight
+from purerl.envs import body_parts, sight
 from purerl.envs.arenas import (
     Arena,
     Floor,
@@ -34,8 +34,9 @@ from purerl.envs.arenas import (
     platform_boxes,
 )
 from purerl.envs.bodies import ANT, RODENT, Body
+from purerl.envs.body_parts import Parts
 from purerl.envs.compose import PREFIX, Composed, compose
-from purerl.envs.feeling import READINGS, felt
+from purerl.envs.feeling import READINGS, felt, proprioception
 from purerl.envs.randomization import Randomization, draw_factors, randomized_fields
 from purerl.envs.trial import LANDED, outcome, steps_beyond
 
@@ -87,6 +88,9 @@ class Options:
     """Whether x and y of the torso can be felt (y always is in a corridor)."""
     observe_bodies: bool = False
     """Whether inertia and velocity of every body (`cinert`, `cvel`) can be felt."""
+    proprioception: bool = False
+    """Whether the observation is a dict that has what the body feels as `imitation` lays it out
+    too, for parts of a network that has imitated."""
     eyes: sight.Sight = sight.Sight()
     """With eyes it is not told of edges; the observation is a dict, and the value function is."""
     randomization: Randomization = Randomization()
@@ -102,6 +106,7 @@ class Run:
     parts: Composed
     action_size: int
     eyes: seeing.Eyes | None
+    limbs: Parts | None  # as `imitation` looks them up, where `proprioception` is asked for
 
     @property
     def control_timestep(self) -> float:
@@ -206,7 +211,7 @@ class Run:
         """Returns [O]: posture and motion in the torso's own frame, forces, and what lies ahead.
 
         With eyes: a dict of `policy` [O], `eyes` [E, H, W] uint8 and, in a corridor, `privileged`,
-        which is what lies ahead.
+        which is what lies ahead. `proprioception` [P] is an entry where it is asked for.
         """
         parts = felt(self.parts, physics, readings, action)
         if self.options.observe_place:
@@ -218,9 +223,14 @@ class Run:
             farthest = self.parts.body.sight
             edges = distances_to_next_edges(task["course"], physics.qpos[0], 6, farthest)
             told = [physics.qpos[1:2], edges]
+        seen = {}
+        if self.limbs:
+            now = body_parts.pose_of(self.limbs, physics, readings)
+            seen["proprioception"] = proprioception(self.limbs, now, physics, readings, action)
         if not self.eyes:
-            return jnp.concatenate(parts + told)
-        seen = {"policy": jnp.concatenate(parts), "eyes": self._pictures(physics, readings, task)}
+            own = jnp.concatenate(parts + told)
+            return seen | {"policy": own} if seen else own
+        seen |= {"policy": jnp.concatenate(parts), "eyes": self._pictures(physics, readings, task)}
         return seen | ({"privileged": jnp.concatenate(told)} if told else {})
 
     def _pictures(self, physics: PhysicsState, readings: Any, task: dict) -> Array:
@@ -285,10 +295,13 @@ def build_arena(options: Options, body: Body) -> Arena:
 def build(options: Options = Options(), engine: str = "auto") -> Run:  # noqa: B008
     """Builds the environment on an engine of `purerl.physics.interface`."""
     body = BODIES[options.body]
-    parts = compose(body, build_arena(options, body), engine)
+    sensors = body_parts.SENSORS[options.body] if options.proprioception else ()
+    parts = compose(body, build_arena(options, body), engine, sensors=sensors)
     model = parts.model
+    limbs = body_parts.of_model(model, options.body) if options.proprioception else None
     readings = READINGS + (BODY_READINGS if options.observe_bodies else ())
-    readings += overflow_reading(engine)
+    readings += overflow_reading(engine) + (body_parts.readings(limbs) if limbs else ())
+    readings = tuple(dict.fromkeys(readings))
     window = tuple(lookup.names(model, "geom")[i] for i in parts.boxes.boxes)
     eye = seeing.of_camera(parts.looks, PREFIX + body.camera)
     return Run(
@@ -297,4 +310,5 @@ def build(options: Options = Options(), engine: str = "auto") -> Run:  # noqa: B
         parts=parts,
         action_size=model.nu,
         eyes=sight.build(parts.looks, eye, body.eye_distance, options.eyes, window),
+        limbs=limbs,
     )

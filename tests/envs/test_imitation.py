@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("h5py", reason="pip install -e '.[clips]'")
 
 from purerl import UserError, clips
-from purerl.envs import body_parts, imitation, recordings
+from purerl.envs import body_parts, imitation, recordings, run
 from purerl.envs.tracking import Reward
 from tests import quick
 from tests.clips import bodies
@@ -310,3 +310,31 @@ def test_squats_keep_the_feet_on_the_floor_and_the_weight_above_them():
         assert abs(min(away)) < 0.01
         behind, ahead = (data.geom_xpos[i, 0] for i in feet[:2])
         assert behind - 0.03 < data.subtree_com[1, 0] < ahead + 0.03
+
+
+def test_a_body_that_runs_feels_what_one_that_imitates_does(tmp_path):
+    model = body_parts.find("rodent", (), "c", 0.004).model
+    crouched = np.tile(model.qpos0, (20, 1))
+    crouched[:, 7:] += np.random.default_rng(0).uniform(-0.2, 0.2, model.nq - 7)
+    crouched[:, 3:7] = [np.cos(0.5), 0.0, 0.1, np.sin(0.5)]  # heading elsewhere
+    clips.write(tmp_path / "motion.h5", clips.pack(model, [crouched], ["Crouch_1"], 50.0), model)
+    chosen = imitation.Options(clips=str(tmp_path / "motion.h5"), control_rate=50)
+    imitates = imitation.build(chosen, "c")
+    runs, plain = (
+        run.build(run.Options(body="rodent", proprioception=felt), "c") for felt in (True, False)
+    )
+    assert runs.control_timestep == pytest.approx(imitates.control_timestep)
+    one, key = begin(imitates, 0, 4), jax.random.key(1)
+    action = jnp.float32(np.random.default_rng(1).uniform(-1.0, 1.0, 38))
+    step = quick.jit(imitates.step)
+    one = step(step(one, action), -action)  # so that all of it moves
+    same = quick.jit(runs.reset)(key).replace(physics=one.physics)
+    after, also = step(one, action), quick.jit(runs.step)(same, action)
+    felt = np.asarray(after.observation["proprioception"])
+    assert felt.shape == (277,) and (np.abs(felt) > 1e-6).mean() > 0.9
+    np.testing.assert_allclose(also.observation["proprioception"], felt, rtol=1e-6, atol=1e-6)
+    bare = quick.jit(plain.step)(
+        plain.reset(jax.random.key(1)).replace(physics=one.physics), action
+    )
+    np.testing.assert_allclose(bare.observation, also.observation["policy"], rtol=1e-5, atol=1e-5)
+    assert also.observation.keys() == {"policy", "proprioception"}
