@@ -4,6 +4,8 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+
 from purerl.checks import findings, held_arrays, user_code
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.devices import memory, programs
@@ -38,7 +40,8 @@ def restore(
       folder: the run.
       update: "latest", "best" (highest evaluation return), or an update's number.
       say: told of damaged checkpoints, and of what is no longer as it was when the run began.
-      engine: instead of the run's own, where that one is not at hand.
+      engine: instead of the run's own. Without one, a run of warp is played on c where there is no
+        GPU: on a CPU warp compiles for minutes.
       trust: whether its code may be executed though it is not known; see `trust.load_copy`.
     """
     run = read_run(Path(folder))
@@ -46,6 +49,9 @@ def restore(
     original = Path(begun["experiment_file"]).absolute()
     source = load_copy(run.path / CODE, run.code, run.config["experiment"], original, trust)
     settings = fill(run.config["settings"], settings_json.to_json(source.experiment), say)
+    if not engine and settings["engine"] == "warp" and jax.default_backend() == "cpu":
+        engine = "c"  # which needs no extra, and begins at once
+        say(f"{folder} was trained on engine warp; it is played on c, for there is no GPU.")
     settings |= {"engine": engine} if engine else {}
     chosen = settings_json.from_json(source.experiment, settings)
     try:

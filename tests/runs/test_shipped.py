@@ -53,6 +53,7 @@ def test_it_opens_in_silence_and_acts(name, elsewhere, capsys, monkeypatch):
     run = purerl.load(name)
     action = run.policy(jax.jit(run.env.reset)(jax.random.key(0)).observation)
     assert action.shape == (run.env.action_size,) and np.isfinite(action).all()
+    assert run.restored.setup.engine == "c"  # on a CPU, though some were trained on warp
     assert [x for x in run.metrics()["eval/episode_return"] if x is not None][-1] > 0.0
     assert capsys.readouterr() == ("", "") and not list(elsewhere.iterdir())
 
