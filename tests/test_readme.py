@@ -54,6 +54,11 @@ def exists(module):
     return spec is not None
 
 
+EXPERIMENTS = ("ant_gaps", "custom_network", "suite", "rodent_gaps_reuse")  # of which pages tell
+# Bodies, tasks and experiments are to be built upon: their modules are imported by name.
+OURS_BESIDE = ("purerl.envs", "purerl.experiments")
+
+
 @functools.cache
 def help_page(*words):
     """Returns the help page of one of our commands: a module, then what has to stand first."""
@@ -68,7 +73,7 @@ def help_page(*words):
 @functools.cache
 def all_help():
     """Returns the help pages of all our commands, those of `run` for some experiments."""
-    pages = [help_page("purerl.run", name) for name in ("ant_gaps", "custom_network", "suite")]
+    pages = [help_page("purerl.run", name) for name in EXPERIMENTS]
     pages.append(help_page("purerl.experiments.benchmarks.suite_benchmark"))
     return "".join([*pages, *(help_page(f"purerl.{n}") for n in COMMANDS if n != "run")])
 
@@ -151,7 +156,7 @@ def test_every_link_of_a_page_leads_somewhere(page):
 def test_python_blocks_import_the_front_door_alone(page):
     for block in blocks(page.read_text(), "python"):
         for node in ast.walk(ast.parse(block)):
-            if isinstance(node, ast.ImportFrom) and node.module.startswith("purerl.envs"):
+            if isinstance(node, ast.ImportFrom) and node.module.startswith(OURS_BESIDE):
                 continue
             if isinstance(node, ast.ImportFrom) and node.module.split(".")[0] == "purerl":
                 assert node.module == "purerl", node.module

@@ -26,7 +26,7 @@ LEFT_OUT = {"checks", "experiment", "machine", "report", "runs", "training", "tu
 LEFT_OUT |= {"adapters.to_gymnasium", "core.errors", "ppo.checks"}
 LEFT_OUT |= {"devices.check_sizes", "devices.memory", "devices.processes"}
 # What is read from a file is data, which the manifest has by itself (`checks/held_arrays.py`).
-LEFT_OUT |= {"clips.__main__", "clips.examine", "clips.files"}
+LEFT_OUT |= {"clips.__main__", "clips.episodes", "clips.examine", "clips.files"}
 
 # Environments and experiments count where they are imported, as a person's own do.
 IMPORTED = {"envs", "experiments", "assets"}
