@@ -42,7 +42,7 @@ class Options:
     """Path of an HDF5 file; rodent: twenty that come with purerl; cmu: two of a humanoid, 0.45 s;
     squats: a computed one of it."""
     clip_set: str = "all"
-    """all, train, test (by their names), a behaviour, or one clip's name."""
+    """all, train, test (by their names), a behaviour, one clip, or of one part: test/Run."""
     held_out: float = 0.2
     """About this share of the clips is `test`."""
     allow: tuple[str, ...] = ()
@@ -217,11 +217,12 @@ def frames(parts: Parts, recording: Recording, clip: Array, frame: Any) -> Pose:
 
 def choose(options: Options, held: clips.Clips) -> clips.Clips:
     """Returns the clips of the set that is asked for."""
-    if options.clip_set == "all":
-        return held
-    if options.clip_set in ("train", "test"):
-        return clips.split(held, options.held_out)[options.clip_set == "test"]
-    return clips.choose(held, options.clip_set)
+    part, _, name = options.clip_set.partition("/")
+    if part in ("train", "test"):
+        held = clips.split(held, options.held_out)[part == "test"]
+    else:
+        name = options.clip_set
+    return held if name in ("", "all") else clips.choose(held, name)
 
 
 def joined(observation: dict[str, Array]) -> Array:

@@ -232,12 +232,13 @@ def reuse(build: Callable[[Any, PyTree, int], Network]) -> Callable[..., Network
             task_key, own_key = jax.random.split(key)
             params, memory = task.init(task_key)
             own = moves.init(own_key, observation[FELT], jnp.zeros(options.code))
-            return {"task": params, "params": own["params"]}, memory
+            return {"params": {"task": params, **own["params"]}}, memory
 
         def apply(params: PyTree, observation: PyTree, memory: PyTree, *noise: PyTree) -> tuple:
-            output, memory = task.apply(params["task"], observation, memory, *noise)
-            own = {"params": params["params"]}
-            answer: Any = moves.apply(own, observation[FELT], output.distribution.loc)
+            own = dict(params["params"])
+            output, memory = task.apply(own.pop("task"), observation, memory, *noise)
+            wish = output.distribution.loc
+            answer: Any = moves.apply({"params": own}, observation[FELT], wish)
             policy, losses = answer
             return PolicyOutput(policy, output.value, losses | output.losses), memory
 

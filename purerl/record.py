@@ -43,7 +43,7 @@ class RecordOptions(EpisodeOptions):
     """What is recorded, and where it is written."""
 
     out: Path = Path("episodes.npz")
-    """File to write: arrays, or HDF5 with names and where the body's parts are if it ends in .h5"""
+    """A new file: arrays, or, if it ends in .h5, HDF5 with names and where the body's parts are."""
     clips: bool = False
     """Write the motion alone, as clips in HDF5."""
     episodes: int = 8
@@ -60,8 +60,8 @@ def command(words: Sequence[str]) -> None:
         raise UserError(f"{len(runs)} runs are given; record one at a time.")
     experiment, options = subject.chosen(found, words, PROG, RecordOptions)
     check_least(options, UserError, episodes=1)
-    files.check_writable(options.out)
-    if options.clips or options.out.suffix == ".h5":
+    files.check_new(options.out)
+    if options.clips or options.out.suffix in (".h5", ".hdf5"):
         command_errors.check_installed("h5py", "clips")
     ((name, run),) = runs.items()
     setup = asking.setup_of(experiment, run)
@@ -82,7 +82,7 @@ def write(options: RecordOptions, arrays: dict[str, Any], env: Any, about: dict[
         tracks = {f"Episode_{i}": x[:length] for i, (x, length) in enumerate(both) if length}
         packed = body.pack(model, [*tracks.values()], [*tracks], 1.0 / env.control_timestep)
         clip_files.write(options.out, packed, model)
-    elif options.out.suffix == ".h5":
+    elif options.out.suffix in (".h5", ".hdf5"):
         from purerl.clips import episodes
 
         episodes.write(options.out, arrays, env, **about)

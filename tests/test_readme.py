@@ -82,7 +82,8 @@ def unknown_options(words):
     """Returns the options of one of our commands that its help page does not have."""
     module, *rest = words
     named = rest[: module in ("purerl.run", "purerl.plan", "purerl.view")]
-    if module == "purerl.check":  # it takes what `run` takes
+    # These take what `run` takes, or the environment's part of it.
+    if module in ("purerl.check", "purerl.ask", "purerl.record"):
         return [w for w in unknown_options(["purerl.run", *rest]) if w not in help_page(module)]
     page = help_page(module, *(re.sub(r"^runs/(\w+)/.*", r"\1", name) for name in named))
     return [word for word in options(rest) if not re.search(rf"{re.escape(word)}\b", page)]

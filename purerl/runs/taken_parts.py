@@ -33,7 +33,10 @@ def read_parts(parts: Mapping[str, Part], abstract: PyTree) -> tuple[Leaves, dic
     """
     leaves, facts = Leaves(), dict[str, Any]()
     for name, part in ((name, part) for name, part in parts.items() if part.run):
-        found, facts[name] = _read(name, part, abstract)
+        try:
+            found, facts[name] = _read(name, part, abstract)
+        except UserError as error:
+            raise UserError(f"parts.{name}.run: {error}") from error
         twice = [key for key in found if (found[key] != leaves.get(key, found[key])).any()]
         if twice:
             raise UserError(f"parts.{name}: {twice[0]} is another in the run of a part before it.")

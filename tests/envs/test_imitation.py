@@ -338,3 +338,21 @@ def test_a_body_that_runs_feels_what_one_that_imitates_does(tmp_path):
     )
     np.testing.assert_allclose(bare.observation, also.observation["policy"], rtol=1e-5, atol=1e-5)
     assert also.observation.keys() == {"policy", "proprioception"}
+
+
+def test_a_behaviour_of_one_part_of_the_clips(place):
+    held = clips.fit(clips.read(place / "motion.h5"), mujoco.MjModel.from_xml_string(XML), 50.0)
+    sides = {}
+    for part in ("train", "test"):
+        chosen = imitation.Options(clip_set=part, held_out=0.5)
+        for name in imitation.choose(chosen, held).names:
+            sides[name] = part
+    assert set(sides.values()) == {"train", "test"}
+    for name, part in sides.items():
+        behaviour = name.partition("_")[0]
+        one = imitation.Options(clip_set=f"{part}/{behaviour}", held_out=0.5)
+        assert imitation.choose(one, held).names == (name,)
+        other = {"train": "test", "test": "train"}[part]
+        wrong = dataclasses.replace(one, clip_set=f"{other}/{behaviour}")
+        with pytest.raises(UserError, match="There is no clip"):
+            imitation.choose(wrong, held)

@@ -164,7 +164,7 @@ def asked():
         one = jax.tree.map(lambda x: x[0], observation)
         network = intention.reuse(wishing)(options, one, ACTIONS)
         own = spread(network.init(jax.random.key(0))[0]["params"])
-        params = {"task": {"wish": jnp.full(3, wish)}, "params": own}
+        params = {"params": {**own, "task": {"wish": jnp.full(3, wish)}}}
         prior = Coder((4,), 3).apply({"params": own["prior"]}, felt)
         output = network.apply(params, observation, ())[0]
         return (

@@ -150,10 +150,11 @@ def test_hdf5_has_each_array_where_it_is_looked_for_and_names_its_axes(mlp, tmp_
         assert found["episodes/2/timesteps/qpos"].shape == (0, 2)
 
 
-def test_hdf5_opens_in_xarray(mlp, tmp_path):
+@pytest.mark.parametrize("ending", ["h5", "hdf5"])
+def test_hdf5_opens_in_xarray(mlp, tmp_path, ending):
     import xarray
 
-    file = tmp_path / "out.h5"
+    file = tmp_path / f"out.{ending}"
     record.write(record.RecordOptions(out=file), mlp.arrays, load(mlp.folder).env, {})
     with xarray.open_datatree(file, engine="h5netcdf") as tree:
         steps = tree["episodes/0/timesteps"]
@@ -206,6 +207,7 @@ def test_a_module_that_is_applied_twice_is_noted_twice():
         (["--episodes", "0"], "episodes is 0; it must be at least 1"),
         (["--out", "/nowhere/x.npz"], "/nowhere/x.npz cannot be written"),
         (["--out", "/tmp"], "/tmp cannot be written"),
+        (["--out", __file__], "is there: name another file, or take that one away"),
         (["--out", "/dev/full", "--episodes", "1"], "/dev/full cannot be written: No space left"),
         (["--lesion.kind", "noise"], "The lesion has no layer: add --lesion.layer"),
         (["--checkpoint", "77"], "There is no checkpoint '77'"),

@@ -155,6 +155,11 @@ def test_what_the_other_run_has_not_is_one_line(old, tmp_path, capsys, words, sa
     assert not place(tmp_path).exists()
 
 
+def test_which_part_has_no_run_is_told():
+    with pytest.raises(UserError, match=r"^parts.decoder.run: nowhere is no folder"):
+        taken_parts.read_parts({"decoder": Part(run="nowhere", reads=())}, {})
+
+
 def test_the_parts_that_the_other_run_has_are_named(old):
     abstract = abstract_state(*objects.build(coded_experiment.experiment)[:3])
     with pytest.raises(UserError, match="no part 'muscles' in .* There are: critic, decoder, enc"):
