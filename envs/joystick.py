@@ -17,6 +17,7 @@ from purerl.envs.arenas import Floor
 from purerl.envs.bodies import RODENT
 from purerl.envs.compose import PREFIX, Composed, compose
 from purerl.envs.feeling import READINGS, felt
+from purerl.envs.randomization import draw_stance
 
 # Each kind of command: least and most speed ahead [m/s], rate of turning [rad/s], and height of the
 # head [m]; it stands with its head at 0.072.
@@ -69,12 +70,9 @@ class Joystick:
     def reset(self, key: Array) -> State:
         """Starts standing, limbs and velocities drawn around rest, under a first command."""
         limbs_key, velocity_key, command_key = jax.random.split(key, 3)
-        model, noise = self.physics.model, self.options.reset_noise
-        limbs = jax.random.uniform(limbs_key, (len(self.parts.qpos),), minval=-noise, maxval=noise)
-        qvel = jax.random.uniform(velocity_key, (model.nv,), minval=-noise, maxval=noise)
-        rest = jnp.asarray(model.qpos0, jnp.float32)
-        qpos = rest.at[jnp.array(self.parts.qpos)].add(limbs, unique_indices=True)
-        physics, readings = self.physics.init(qpos, qvel)
+        noise = self.options.reset_noise
+        start = draw_stance(limbs_key, velocity_key, self.parts, noise)
+        physics, readings = self.physics.init(*start)
         task = {"commands": command_key, "command": self._command(command_key, physics.time)}
         return self._state(physics, readings, task, jnp.zeros(self.action_size))
 

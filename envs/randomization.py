@@ -1,4 +1,4 @@
-"""What differs of a model between episodes: factors on friction, masses and strength."""
+"""What differs between episodes: how a walker stands; factors on friction, masses, strength."""
 
 import dataclasses
 from typing import Any
@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from purerl import Array
+from purerl.envs.compose import Composed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,6 +27,24 @@ class Randomization:
             low, high = getattr(self, name)
             if not 0.0 < low <= high:
                 raise ValueError(f"{name} is {(low, high)}; give factors 0 < least <= greatest.")
+
+
+def draw_stance(
+    limbs_key: Array, velocity_key: Array, parts: Composed, noise: float
+) -> tuple[Array, Array]:
+    """Draws qpos [nq] and qvel [nv] of a walker that stands: joints and velocities around rest.
+
+    Args:
+      limbs_key: of its joints.
+      velocity_key: of all velocities.
+      parts: the walker.
+      noise: half-width of what is drawn [rad, m/s, rad/s].
+    """
+    limbs = jax.random.uniform(limbs_key, (len(parts.qpos),), minval=-noise, maxval=noise)
+    qvel = jax.random.uniform(velocity_key, (parts.model.nv,), minval=-noise, maxval=noise)
+    rest = jnp.asarray(parts.model.qpos0, jnp.float32)
+    # Unique: a sum of terms that might meet would have no fixed order on a GPU.
+    return rest.at[jnp.array(parts.qpos)].add(limbs, unique_indices=True), qvel
 
 
 def draw_factors(key: Array, randomization: Randomization) -> dict[str, Array]:

@@ -37,7 +37,7 @@ from purerl.envs.bodies import ANT, RODENT, Body
 from purerl.envs.body_parts import Parts
 from purerl.envs.compose import PREFIX, Composed, compose
 from purerl.envs.feeling import READINGS, felt, proprioception
-from purerl.envs.randomization import Randomization, draw_factors, randomized_fields
+from purerl.envs.randomization import Randomization, draw_factors, draw_stance, randomized_fields
 from purerl.envs.trial import LANDED, outcome, steps_beyond
 
 BODIES = {"ant": ANT, "rodent": RODENT}
@@ -116,16 +116,12 @@ class Run:
     def reset(self, key: Array) -> State:
         """Starts standing, limbs and velocities drawn around rest, in a corridor of its own."""
         limbs_key, velocity_key, course_key, model_key = jax.random.split(key, 4)
-        model, noise = self.physics.model, self.options.reset_noise
-        limbs = jax.random.uniform(limbs_key, (len(self.parts.qpos),), minval=-noise, maxval=noise)
-        qvel = jax.random.uniform(velocity_key, (model.nv,), minval=-noise, maxval=noise)
-        rest = jnp.asarray(model.qpos0, jnp.float32)
-        # Unique: a sum of terms that might meet would have no fixed order on a GPU.
-        qpos = rest.at[jnp.array(self.parts.qpos)].add(limbs, unique_indices=True)
+        noise = self.options.reset_noise
+        qpos, qvel = draw_stance(limbs_key, velocity_key, self.parts, noise)
         factors = draw_factors(model_key, self.options.randomization)
         task: dict[str, Any] = {"factors": factors}
         if factors:
-            task["fields"] = self.physics.derive(randomized_fields(model, factors))
+            task["fields"] = self.physics.derive(randomized_fields(self.physics.model, factors))
         if isinstance(self.parts.arena, GapsCorridor):
             task["course"] = draw_course(course_key, self.parts.arena)
             task["crossed"] = jnp.zeros((), jnp.int32)

@@ -19,8 +19,8 @@ from purerl.clips import body
 from purerl.envs import joystick, run
 
 EACH = 4  # clips of a kind
-FRAMES = 125
-RATE = 50.0
+RATE = 50.0  # control steps a second of both
+FRAMES = round(joystick.Options().hold * RATE)
 MIDDLES = {name: np.mean(ranges, axis=1) for name, ranges in joystick.COMMANDS.items()}
 
 
