@@ -1,8 +1,10 @@
 """What all tests share."""
 
 import atexit
+import contextlib
 import ctypes.util
 import gc
+import itertools
 import os
 import shutil
 import tempfile
@@ -27,7 +29,7 @@ import pytest  # noqa: E402
 
 from purerl.core.errors import RunError  # noqa: E402
 from purerl.report.opengl import open_gl  # noqa: E402
-from purerl.training import seeds  # noqa: E402
+from purerl.training import seeds, train  # noqa: E402
 from tests import quick  # noqa: E402
 
 # The same examples every time: a failure belongs to the change that is tested.
@@ -40,6 +42,18 @@ jax.config.update("jax_debug_key_reuse", True)  # a key consumed twice raises
 # 2026): begun last, one would run alone at the end.
 LONGEST = ("shards", "run", "suite", "interface", "golden", "algorithm", "probes", "kill", "seeds")
 LONGEST += ("parts", "threads")
+
+
+@pytest.fixture
+def stop_after(monkeypatch):
+    """Makes the runs that follow stop by themselves, when they ask for the n-th time."""
+
+    def use(questions: int) -> None:
+        left = itertools.chain(itertools.repeat(False, questions), itertools.repeat(True))
+        signals = contextlib.nullcontext(lambda: next(left))
+        monkeypatch.setattr(train.signals, "stop_signals", lambda _: signals)
+
+    return use
 
 
 @pytest.fixture(scope="session")

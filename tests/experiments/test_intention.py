@@ -1,6 +1,5 @@
 """Networks that act through a code: what it costs, and how another task uses it again."""
 
-import contextlib
 import dataclasses
 import json
 import shutil
@@ -18,11 +17,9 @@ from purerl.experiment import objects
 from purerl.experiments import intention, rodent_gaps_reuse, rodent_intention
 from purerl.experiments.intention import Coder, Decoder, divergence, in_ball
 from purerl.machine.state_arrays import leaf_paths
-from purerl.training import train
 from tests import quick
 from tests.experiments import toy_imitating, toy_reusing
 from tests.training.test_network_parts import saved
-from tests.training.test_run import Stopper
 
 pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly", "programs_are_kept")
 
@@ -329,16 +326,11 @@ def test_what_a_code_costs_is_logged(old, reused):
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on_without_the_run_it_was_taken_from(old, reused, tmp_path, monkeypatch):
+def test_a_killed_run_goes_on_without_the_run_it_was_taken_from(old, reused, tmp_path, stop_after):
     copy = shutil.copytree(old, tmp_path / "gone")
-
-    @contextlib.contextmanager
-    def signals(_):
-        yield Stopper(5)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(train.signals, "stop_signals", signals)
-        assert start(toy_reusing, tmp_path, *taking(copy)) == INTERRUPTED
+    stop_after(5)
+    assert start(toy_reusing, tmp_path, *taking(copy)) == INTERRUPTED
+    stop_after(10**9)
     shutil.rmtree(copy)
     assert start(toy_reusing, tmp_path, "--resume") == SUCCESS
     assert logged(tmp_path / "toy_reusing/seed1")[-1]["digest"] == logged(reused)[-1]["digest"]

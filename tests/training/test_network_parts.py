@@ -1,6 +1,5 @@
 """A part of a network that is another run's: frozen or not, in its units, without its folder."""
 
-import contextlib
 import json
 import shutil
 from dataclasses import replace
@@ -21,10 +20,8 @@ from purerl.machine import array_files
 from purerl.machine.state_arrays import flatten
 from purerl.runs import checkpoint_folder, taken_parts
 from purerl.runs.loaded_run import load
-from purerl.training import train
 from tests.experiment.test_resumed_settings import refusal
 from tests.runs import coded_experiment
-from tests.training.test_run import Stopper
 
 pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly", "programs_are_kept")
 
@@ -101,16 +98,11 @@ def test_losses_and_weights_are_logged_by_name(whole):
     assert weights[0] == 0.0 and weights[3] == pytest.approx(0.1 * 96 / 200)
 
 
-def test_a_killed_run_goes_on_without_the_other_run(old, whole, tmp_path, monkeypatch, capsys):
+def test_a_killed_run_goes_on_without_the_other_run(old, whole, tmp_path, stop_after, capsys):
     copy = shutil.copytree(old, tmp_path / "gone")
-
-    @contextlib.contextmanager
-    def signals(_):
-        yield Stopper(5)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(train.signals, "stop_signals", signals)
-        assert start(tmp_path, *taking(copy)) == INTERRUPTED
+    stop_after(5)
+    assert start(tmp_path, *taking(copy)) == INTERRUPTED
+    stop_after(10**9)
     shutil.rmtree(copy)
     assert start(tmp_path, "--resume") == SUCCESS, capsys.readouterr().err
     assert told(tmp_path)[-1]["digest"] == told(whole)[-1]["digest"]

@@ -1,6 +1,5 @@
 """The run command: the same bits however it is interrupted, and one line for every mistake."""
 
-import contextlib
 import dataclasses
 import errno
 import importlib.util
@@ -74,31 +73,6 @@ def wait_for(condition, process: subprocess.Popen, timeout: float = 60.0) -> Non
 
 def checkpoints(runs: Path) -> list[int]:
     return checkpoint_folder.updates(folder(runs) / "checkpoints")
-
-
-class Stopper:
-    """Asks to stop at the n-th question."""
-
-    def __init__(self, questions: int) -> None:
-        self.left = questions
-
-    def __call__(self) -> bool:
-        self.left -= 1
-        return self.left < 0
-
-
-@pytest.fixture
-def stop_after(monkeypatch):
-    """Makes the next run stop by itself after some questions."""
-
-    def use(questions: int) -> None:
-        monkeypatch.setattr(train.signals, "stop_signals", lambda _: one(questions))
-
-    @contextlib.contextmanager
-    def one(questions):
-        yield Stopper(questions)
-
-    return use
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """Several seeds in one command: mapped they are single runs, vmapped they stay together."""
 
-import contextlib
 import json
 from pathlib import Path
 
@@ -12,8 +11,8 @@ from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE, RunError, U
 from purerl.devices import programs
 from purerl.machine import state_arrays
 from purerl.runs import checkpoint, checkpoint_folder
-from purerl.training import console, loop, seeds, train, writer
-from tests.training.test_run import ROOT, TOY, Stopper, digest, folder, lines, start
+from purerl.training import console, loop, seeds, writer
+from tests.training.test_run import ROOT, TOY, digest, folder, lines, start
 
 # Bits are compared with those of runs that are compiled so too.
 pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly", "programs_are_kept")
@@ -31,20 +30,6 @@ def vmapped(tmp_path_factory) -> Path:
     runs = tmp_path_factory.mktemp("vmapped")
     assert start(runs, *THREE) == SUCCESS
     return runs
-
-
-@pytest.fixture
-def stop_after(monkeypatch):
-    """Makes the next run stop by itself after some questions."""
-
-    def use(questions: int) -> None:
-        @contextlib.contextmanager
-        def signals(_):
-            yield Stopper(questions)
-
-        monkeypatch.setattr(train.signals, "stop_signals", signals)
-
-    return use
 
 
 def kept(runs: Path, seed: str) -> list[int]:
