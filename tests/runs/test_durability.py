@@ -25,7 +25,6 @@ from tests.training.test_run import (
     lines,
     refused,
     start,
-    stop_after,  # noqa: F401 (a fixture)
     whole,  # noqa: F401 (a fixture)
 )
 
@@ -36,7 +35,7 @@ WORDS = ("--checkpoints", "4")
 
 
 @pytest.fixture
-def stopped(tmp_path, stop_after):  # noqa: F811
+def stopped(tmp_path, stop_after):
     """A run that was stopped after two of its four checkpoints, and may go on."""
     stop_after(14)
     start(tmp_path, *WORDS)
