@@ -14,6 +14,7 @@ import hashlib
 import os
 import sys
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -39,6 +40,24 @@ def use(folder: str) -> None:
 def in_use() -> str:
     """Returns the folder that JAX keeps compiled programs in, "" if it has none."""
     return (jax.config.values["jax_compilation_cache_dir"] or "").removeprefix(PREFIX)
+
+
+def kept(name: str, make: Callable[[], bytes]) -> bytes:
+    """Returns what `make` returns, from the folder if some process has made it under this name.
+
+    The name has to say all that the result depends on, such as by a hash.
+    """
+    folder = in_use() if jax.config.values["jax_enable_compilation_cache"] else ""
+    if not folder or "://" in folder:
+        return make()
+    entry = CheckedPath(folder, "kept", name + ENTRY)  # JAX looks in no folder of its folder
+    with contextlib.suppress(OSError):
+        return entry.read_bytes()
+    made = make()
+    with contextlib.suppress(OSError):  # a disk that is full, or nobody's to write on
+        entry.parent.mkdir(exist_ok=True)
+        entry.write_bytes(made)
+    return made
 
 
 def seal(name: str, program: bytes | memoryview) -> bytes:

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import threading
+import types
 from pathlib import Path
 
 import jax
@@ -160,6 +161,29 @@ def test_a_folder_that_is_not_local_is_left_to_jax():
 def test_a_folder_that_cannot_be_written_is_no_hindrance(cache):
     """`/proc` refuses the superuser too."""
     assert compute("/proc/purerl")[0] == cache[1][0]
+
+
+def test_what_is_kept_is_made_once_and_anew_when_it_is_damaged(tmp_path, monkeypatch):
+    monkeypatch.setattr(compile_cache, "in_use", lambda: str(tmp_path))
+    made = []
+
+    def make():
+        made.append(len(made))
+        return b"%d" % len(made)
+
+    assert [compile_cache.kept("x", make) for _ in range(3)] == [b"1"] * 3
+    assert compile_cache.kept("y", make) == b"2"
+    (tmp_path / "kept" / "x-cache").write_bytes(b"1")  # without its hash
+    assert [compile_cache.kept("x", make) for _ in range(2)] == [b"3"] * 2
+    with monkeypatch.context() as off:
+        values = {"jax_enable_compilation_cache": False}
+        config = types.SimpleNamespace(values=values)
+        off.setattr(compile_cache, "jax", types.SimpleNamespace(config=config))
+        assert compile_cache.kept("x", make) == b"4"
+    for nowhere in ("", "gs://bucket", "/proc/purerl"):
+        monkeypatch.setattr(compile_cache, "in_use", lambda folder=nowhere: folder)
+        compile_cache.kept("x", make)
+    assert len(made) == 7 and [x.name for x in tmp_path.iterdir()] == ["kept"]
 
 
 def test_the_folder_is_told_without_the_prefix():

@@ -16,7 +16,7 @@ import pytest
 import purerl
 from purerl import run
 from purerl.core.errors import SUCCESS, USAGE, UserError
-from purerl.devices import compilation
+from purerl.devices import compilation, compile_cache
 from purerl.experiment import loading, source_hashes
 from purerl.ppo import losses
 from purerl.runs.loaded_run import Run
@@ -113,6 +113,19 @@ def test_a_comment_and_a_docstring_change_no_hash(copy):
 def test_what_a_file_does_counts_and_what_it_says_does_not(before, after, same):
     hashes = [source_hashes.hash_code(text.encode()) for text in (before, after)]
     assert (hashes[0] == hashes[1]) == same
+
+
+def test_a_hash_that_is_kept_is_of_this_text_this_python_and_this_way(tmp_path, monkeypatch):
+    monkeypatch.setattr(compile_cache, "in_use", lambda: str(tmp_path))
+    texts = [b"x = 1", b"x = 1  # one", b"x = 2"]
+    hashes = [source_hashes.hash_code(text) for text in texts]
+    assert [source_hashes.known_hash(text) for text in texts * 2] == hashes * 2
+    assert len(list((tmp_path / "kept").iterdir())) == 3
+    for name, value in ((sys, "version"), (source_hashes, "_BY")):
+        with monkeypatch.context() as other:
+            other.setattr(name, value, "another")
+            source_hashes.known_hash(texts[0])
+    assert len(list((tmp_path / "kept").iterdir())) == 5
 
 
 def test_a_new_room_and_a_new_folder_in_a_room_count_by_themselves(copy):
