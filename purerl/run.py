@@ -15,6 +15,7 @@ Exit codes: 0 done, 1 the run cannot go on, 2 a mistake in the command, 3 stoppe
 import os
 import shlex
 import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,7 @@ def command(words: Sequence[str]) -> int:
 
 def _train(words: Sequence[str]) -> None:
     """Parses, trains, and with --video shows the policy of the first seed."""
+    began = time.perf_counter()
     from purerl import render
     from purerl.report.opengl import choose_gl
     from purerl.training import train
@@ -58,7 +60,7 @@ def _train(words: Sequence[str]) -> None:
     source, chosen, options = read_experiment(words, "python -m purerl.run", choose=train.as_begun)
     # Before mujoco is imported, which looks for OpenGL itself.
     video = options.video and _attempt("video", choose_gl)
-    folders = train.train_runs(source, chosen, options, os._exit)
+    folders = train.train_runs(source, chosen, options, os._exit, began)
     if video:
         from purerl.devices.processes import is_first
 

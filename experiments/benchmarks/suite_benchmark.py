@@ -20,7 +20,7 @@ from pathlib import Path
 
 from purerl.core.errors import INTERRUPTED, SUCCESS, USAGE, UserError, unknown_name
 from purerl.envs.suite.tasks import TASKS
-from purerl.experiments.benchmarks import suite_pictures, suite_scores
+from purerl.experiments.benchmarks import suite_clock, suite_pictures, suite_scores
 from purerl.machine.command_errors import leave
 from purerl.report.run_reader import read
 from purerl.runs.folder import runs_in
@@ -157,16 +157,17 @@ def words(
 
 
 def report(seeds: Sequence[suite_scores.Seed], out: Path) -> None:
-    """Writes seeds.csv, tasks.csv and the pictures, and prints what is ahead of whom."""
+    """Writes seeds.csv, tasks.csv, clock.csv and the pictures, and prints what is ahead of whom."""
     tasks, published = suite_scores.by_task(seeds), suite_scores.references()
+    by_time = suite_clock.references()
     if not tasks:
         print("No seed has come to its end yet.")
         return
     out.mkdir(parents=True, exist_ok=True)
     suite_scores.write_seeds(out / "seeds.csv", seeds)
     rows = suite_scores.table(tasks, published)
-    with (out / "tasks.csv").open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows(rows)
+    _write(out / "tasks.csv", rows)
+    _write(out / "clock.csv", suite_clock.table(tasks, by_time))
     for row in rows:
         print(" ".join([f"{row[0]:24}", *(f"{cell!s:>12}" for cell in row[1:])]))
     print(suite_pictures.summary(tasks))
@@ -174,10 +175,16 @@ def report(seeds: Sequence[suite_scores.Seed], out: Path) -> None:
         above, below = suite_scores.ahead(tasks, published, column)
         short = f"; short: {', '.join(below)}" if below else ""
         print(f"at or above {column}: {len(above)} of {len(above) + len(below)}{short}")
-    for across in ("steps", "seconds"):
-        suite_pictures.draw_tasks(out / f"tasks_over_{across}.png", tasks, published, across)
+    print(*suite_clock.verdicts(tasks, by_time), sep="\n")
+    suite_pictures.draw_tasks(out / "tasks_over_steps.png", tasks, published, {}, "steps")
+    suite_pictures.draw_tasks(out / "tasks_over_seconds.png", tasks, {}, by_time, "seconds")
     suite_pictures.draw_together(out / "together.png", tasks)
     print(*(str(path) for path in sorted(out.glob("t*.png"))), sep="\n")
+
+
+def _write(path: Path, rows: Iterable[Sequence[object]]) -> None:
+    with path.open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from purerl.experiments.benchmarks.suite_clock import TIMES, Published
 from purerl.experiments.benchmarks.suite_scores import (
     BEST,
     LEVELS,
@@ -19,18 +20,24 @@ from purerl.report import bootstrap
 from purerl.report.comparison import plotter
 
 LINES = {"brax_ppo_end": ("brax PPO", "C1"), "reppo_end": ("REPPO, 200 M", "C2")}
+POINTS = {"reppo": "C2", "brax_ppo": "C1", "brax_sac": "C3"}
 COLUMNS = 5
 
 
 def draw_tasks(
-    path: Path, tasks: dict[str, list[Seed]], published: dict[str, dict[str, float]], across: str
+    path: Path,
+    tasks: dict[str, list[Seed]],
+    published: dict[str, dict[str, float]],
+    by_time: Published,
+    across: str,
 ) -> None:
     """Writes a picture with a panel for each task: IQM, interval, seeds, published returns.
 
     Args:
       path: of the PNG.
       tasks: `by_task`.
-      published: `references`.
+      published: `references`, drawn as lines.
+      by_time: `suite_clock.references`, drawn as points at their seconds.
       across: "steps" or "seconds".
     """
     pyplot = plotter()
@@ -44,6 +51,10 @@ def draw_tasks(
         panel.set_axis_off()
     for panel, (task, seeds) in zip(panels.flat, tasks.items(), strict=False):
         _draw_task(panel, seeds, published.get(task, {}), across)
+        for name, color in POINTS.items():
+            if task in by_time and name in by_time[task]:
+                values = [np.nan if x is None else x for x in by_time[task][name]]
+                panel.plot(TIMES, values, "o:", color=color, markersize=3, linewidth=1, label=name)
         panel.set_title(f"{task} (n = {len(seeds)})", fontsize="small")
     panels.flat[0].legend(fontsize="x-small")
     figure.supxlabel("control steps" if across == "steps" else "seconds")

@@ -22,6 +22,7 @@ METRIC = "eval/episode_return"
 BEST = 1000.0  # the greatest return of an episode of 1000 steps
 REFERENCES = Path(__file__).parent / "suite_reference.csv"
 COLUMNS = ("task", "seed", "status", "steps", "return", "seconds")  # of seeds.csv
+MORE = ("start", "machine")  # of seeds.csv too, if it is of this version
 SHOWN = ("brax_ppo_10M", "brax_ppo_end", "reppo_end", "tdmpc2_4M")  # columns of the table
 LEVELS = np.linspace(0.0, BEST, 101)
 
@@ -34,21 +35,32 @@ class Seed(NamedTuple):
     status: str  # "done", "failed" or "unfinished"
     steps: tuple[int, ...]  # of each evaluation
     returns: tuple[float, ...]  # of each evaluation
-    seconds: tuple[float, ...]  # since the run began, at each evaluation
+    seconds: tuple[float, ...]  # since its command began, at each evaluation
+    start: float | None = None  # [s] until its first line of metrics; compiling is most of it
+    machine: str = ""  # what it was trained on
 
     @property
     def score(self) -> float:
         """The last return. A run that failed before its first evaluation has learned nothing: 0."""
         return self.returns[-1] if self.returns else 0.0
 
+    def score_at(self, second: float) -> float:
+        """Returns what the newest evaluation by then returned; 0 before the first."""
+        return next(
+            (r for r, s in zip(self.returns[::-1], self.seconds[::-1], strict=True) if s <= second),
+            0.0,
+        )
+
 
 def seed_of(run: RunRecord) -> Seed:
     """Returns what a run on a task scored."""
-    return Seed(run.settings["env.task"], run.seed, run.status, *evaluations(run))
+    start = next((line["wall_s"] for line in run.lines if "wall_s" in line), None)
+    machine = str(run.manifest.get("device", {}).get("kind", ""))
+    return Seed(run.settings["env.task"], run.seed, run.status, *evaluations(run), start, machine)
 
 
 def evaluations(run: RunRecord) -> tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]:
-    """Returns steps, return and seconds since the run began, at each evaluation of a run."""
+    """Returns steps, return and seconds since its command began, at each evaluation of a run."""
     lines = [line for line in run.lines if line.get(METRIC) is not None]
     return (
         tuple(line["steps"] for line in lines),
@@ -64,13 +76,13 @@ def write_seeds(path: Path, seeds: Iterable[Seed]) -> None:
     """Writes a row for each evaluation of each seed; a seed without one has a row too."""
     with path.open("w", newline="") as file:
         rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(COLUMNS)
+        rows.writerow(COLUMNS + MORE)
         for s in seeds:
-            name = s.task, s.seed, s.status
+            name, more = (s.task, s.seed, s.status), ("" if s.start is None else s.start, s.machine)
             if not s.steps:
-                rows.writerow([*name, "", "", ""])
+                rows.writerow([*name, "", "", "", *more])
             for steps, value, seconds in zip(s.steps, s.returns, s.seconds, strict=True):
-                rows.writerow([*name, steps, f"{value:.2f}", f"{seconds:.1f}"])
+                rows.writerow([*name, steps, f"{value:.2f}", f"{seconds:.1f}", *more])
 
 
 def read_seeds(path: Path) -> list[Seed]:
@@ -94,17 +106,18 @@ def read_seeds(path: Path) -> list[Seed]:
 
 def _seeds_of(rows: Iterable[dict[str, str]]) -> list[Seed]:
     """Returns the seeds whose evaluations `rows` are."""
-    found: dict[tuple[str, int, str], list[tuple[int, float, float]]] = {}
+    found: dict[tuple[str, int, str], Seed] = {}
     for row in rows:
-        points = found.setdefault((row["task"], int(row["seed"]), row["status"]), [])
+        name = row["task"], int(row["seed"]), row["status"]
+        start = float(row["start"]) if row.get("start") else None
+        s = found.setdefault(name, Seed(*name, (), (), (), start, row.get("machine") or ""))
         if row["steps"]:
-            points.append((int(row["steps"]), float(row["return"]), float(row["seconds"])))
-    return [
-        Seed(*name, *(tuple(column) for column in zip(*points, strict=True)))
-        if points
-        else Seed(*name, (), (), ())
-        for name, points in found.items()
-    ]
+            found[name] = s._replace(
+                steps=(*s.steps, int(row["steps"])),
+                returns=(*s.returns, float(row["return"])),
+                seconds=(*s.seconds, float(row["seconds"])),
+            )
+    return list(found.values())
 
 
 def merged(sources: Iterable[Iterable[Seed]]) -> list[Seed]:

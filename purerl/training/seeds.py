@@ -8,6 +8,7 @@ disk.
 
 import functools
 import hashlib
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -53,6 +54,7 @@ class Job(NamedTuple):
     facts: dict[str, Any]  # what manifest.json says of a run that begins now
     stop: Callable[[], bool]  # tells whether a signal asked to stop
     taken: dict[str, Any] | None  # of other runs, for the first state; in the first process
+    began: float = 0.0  # when the command began, by `time.perf_counter` [s]
     listener: Callable[[Record], Any] | None = None  # called with each line of metrics
 
 
@@ -70,14 +72,15 @@ def train_all(job: Job, seeds: list[Seed]) -> None:
     fresh = in_first_process(lambda: not all(s.folder and s.folder.updates for s in seeds))
     programs = functools.cache(lambda: _compile(job, fresh))
     groups = [[seed] for seed in seeds] if job.options.vmapped_seeds == 1 else [seeds]
-    failed = []
+    failed, began = [], job.began
     for group in groups:
         try:
-            _train_together(job, group, programs)
+            _train_together(job, group, programs, began)
         except RunError as error:  # the seeds after it can still be trained
             failed.append(str(error))
             if len(groups) > 1:  # they may take long, or be stopped
                 command_errors.tell(error)
+        began = time.perf_counter()  # the next one's clock begins
     if failed:
         raise RunError(" ".join(failed))
 
@@ -101,7 +104,9 @@ def _unordered(programs: Programs) -> list[str]:
     return programs.unordered if jax.default_backend() == "gpu" else []
 
 
-def _train_together(job: Job, seeds: list[Seed], programs: Callable[[], Programs]) -> None:
+def _train_together(
+    job: Job, seeds: list[Seed], programs: Callable[[], Programs], began: float
+) -> None:
     """Trains one run, or vmapped ones, from the newest checkpoint that all of them have."""
     with ExitStack() as stack:
         progress: Any = processes.Silent()
@@ -137,6 +142,7 @@ def _train_together(job: Job, seeds: list[Seed], programs: Callable[[], Programs
         stop = processes.agreed(job.stop)
         with user_code.program_errors():
             state = compiled.spread(state)
+            meta |= {"wall_s": meta["wall_s"] + time.perf_counter() - began}
             loop.train(job.plan, compiled, state, writers, progress, stop, meta, best, job.listener)
         for seed, writer in zip(seeds, writers, strict=True):
             of = f" of {seed.path.name}" if job.options.num_seeds > 1 else ""

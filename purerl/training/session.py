@@ -44,6 +44,7 @@ def execute(
     found: Sequence[Folder],
     options: RunOptions,
     stop: Stop,
+    began: float,
     listener: Any = None,
 ) -> None:
     """Prepares the folders and the programs, and trains.
@@ -54,6 +55,7 @@ def execute(
       found: what each folder held when the command began.
       options: the run's options.
       stop: tells whether a signal asked to stop.
+      began: when the command began, by `time.perf_counter` [s].
       listener: called with each line of metrics, or None.
     """
     with processes.fail_together(), ExitStack() as stack:
@@ -62,7 +64,8 @@ def execute(
         in_first_process(lambda: resume.check_new_or_resume(found, experiments, options.resume))
         loggers.check_loggers(options)
         cache = compilation.set_up_jax(options.cache)
-        job = prepare(source, experiments[0], found, options, stop)._replace(listener=listener)
+        job = prepare(source, experiments[0], found, options, stop)
+        job = job._replace(began=began, listener=listener)
         train_all(job, begin(source, runs, job, cache, stack))
 
 

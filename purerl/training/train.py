@@ -9,6 +9,7 @@ import os
 import platform
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Unpack, overload
@@ -77,6 +78,7 @@ def train(
             "A run keeps a copy of its experiment's file, and an Experiment object has none: put "
             "it into a .py file and give train that file's path. Change its settings by settings=."
         )
+    began = time.perf_counter()
     set_xla_flags_in_time()
     listener = options.pop("on_metrics", None)
     if not (listener is None or callable(listener)):
@@ -85,12 +87,18 @@ def train(
     chosen, how = command_line.from_settings(source, settings or {}, options, choose=as_begun)
     if how.video:
         raise UserError("video is an option of the command; call `python -m purerl.render RUN`.")
-    runs = [Run(path, trust=True) for path in train_runs(source, chosen, how, _raise, listener)]
+    folders = train_runs(source, chosen, how, _raise, began, listener)
+    runs = [Run(path, trust=True) for path in folders]
     return runs if "num_seeds" in options else runs[0]
 
 
 def train_runs(
-    source: Source, chosen: Experiment, options: RunOptions, end: Callable, listener: Any = None
+    source: Source,
+    chosen: Experiment,
+    options: RunOptions,
+    end: Callable,
+    began: float,
+    listener: Any = None,
 ) -> list[Path]:
     """Trains an experiment of every seed; returns their folders.
 
@@ -99,6 +107,7 @@ def train_runs(
       chosen: the experiment with its overrides.
       options: the run's options.
       end: called with an exit code at the second signal.
+      began: when the command began, by `time.perf_counter` [s]: where `wall_s` is 0.
       listener: called with each line of metrics, or None.
     """
     from purerl.runs import folder, manifest
@@ -115,7 +124,7 @@ def train_runs(
         set_portable_flags_in_time()
     threads.leave_one(chosen.engine)
     with signals.stop_signals(end) as stop:
-        execute(source, runs, found, options, stop, listener)
+        execute(source, runs, found, options, stop, began, listener)
     return list(runs)
 
 

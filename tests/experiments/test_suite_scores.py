@@ -7,7 +7,12 @@ import pytest
 
 from purerl.core.errors import INTERRUPTED, SUCCESS, USAGE, UserError
 from purerl.envs.suite.tasks import TASKS
-from purerl.experiments.benchmarks import suite_benchmark, suite_pictures, suite_scores
+from purerl.experiments.benchmarks import (
+    suite_benchmark,
+    suite_clock,
+    suite_pictures,
+    suite_scores,
+)
 from purerl.experiments.benchmarks.suite_scores import Seed
 
 
@@ -38,8 +43,58 @@ def test_a_seed_that_failed_counts_and_one_that_is_unfinished_does_not():
 
 
 def test_what_is_written_is_read_back(tmp_path):
+    seeds = [*SEEDS, seed(9, 1.0)._replace(start=20.5, machine="a GPU")]
+    suite_scores.write_seeds(tmp_path / "seeds.csv", seeds)
+    assert sorted(suite_scores.read_seeds(tmp_path / "seeds.csv")) == sorted(seeds)
+
+
+def test_files_of_earlier_versions_are_read(tmp_path):
     suite_scores.write_seeds(tmp_path / "seeds.csv", SEEDS)
+    lines = (tmp_path / "seeds.csv").read_text().splitlines()
+    old = "\n".join(",".join(line.split(",")[:6]) for line in lines)
+    (tmp_path / "seeds.csv").write_text(old)
     assert sorted(suite_scores.read_seeds(tmp_path / "seeds.csv")) == sorted(SEEDS)
+
+
+# --- by the clock ---
+
+
+def timed(number, *points, start=30.0, status="done"):
+    """A seed of points (second, return)."""
+    seconds, returns = zip(*points, strict=True) if points else ((), ())
+    steps = tuple(range(len(points)))
+    return Seed("fish-swim", number, status, steps, returns, seconds, start, "a GPU")
+
+
+TIMED = [
+    timed(1, (100.0, 300.0), (126.0, 465.0), (127.0, 999.0), (700.0, 600.0), start=20.0),
+    timed(2, (126.1, 500.0), (316.0, 700.0)),
+    timed(3, status="failed", start=None),
+]
+THEIRS = {"fish-swim": {"x": [155.0, 566.0, None, 400.0], "y": [156.0, None, None, None]}}
+
+
+def test_a_return_by_the_clock_is_the_newest_evaluations_by_then():
+    head, row = suite_clock.table({"fish-swim": TIMED}, THEIRS)
+    row = dict(zip(head, row, strict=True))
+    # 465, 0, 0; then 999, 700, 0; then the same, and 600, 700, 0: of three the IQM is all's mean.
+    assert [row[f"purerl_{t}"] for t in suite_clock.TIMES] == [155.0, 566.3, 566.3, 433.3]
+    assert [row[f"lowest_{t}"] for t in suite_clock.TIMES] == [0.0] * 4
+    assert (row["n"], row["machine"], row["start"]) == (3, "a GPU", 25.0)
+    assert [row[f"x_{t}"] for t in suite_clock.TIMES] == [155.0, 566.0, "", 400.0]
+    assert list(suite_clock.verdicts({"fish-swim": TIMED}, THEIRS)) == [
+        "at or above x after 126 s: 1 of 1",
+        "at or above x after 316 s: 1 of 1",
+        "at or above x after 1200 s: 1 of 1",
+        "at or above y after 126 s: 0 of 1; short: fish-swim",
+    ]
+
+
+def test_what_others_reached_by_then_is_of_tasks_that_there_are_and_never_of_the_future():
+    published = suite_clock.references()
+    assert set(published) <= set(TASKS) and suite_clock.names(published)[0] == "reppo"
+    assert published["humanoid-run"]["reppo"] == [13, 235, 570, 760]
+    assert published["cheetah-run"]["brax_sac"] == [729, 881, None, None]
 
 
 def test_a_file_of_other_columns_is_named_with_what_it_lacks(tmp_path):
@@ -216,10 +271,11 @@ def test_for_a_gpu_all_but_the_humanoids_are_trained_with_its_settings(monkeypat
 @pytest.mark.slow
 def test_pictures_are_drawn(tmp_path):
     tasks = suite_scores.by_task([s for s in SEEDS if s.task == "cheetah-run"])
-    for across in ("steps", "seconds"):
-        suite_pictures.draw_tasks(tmp_path / "a.png", tasks, suite_scores.references(), across)
+    by_time = suite_clock.references()
+    suite_pictures.draw_tasks(tmp_path / "a.png", tasks, suite_scores.references(), {}, "steps")
+    suite_pictures.draw_tasks(tmp_path / "c.png", tasks, {}, by_time, "seconds")
     suite_pictures.draw_together(tmp_path / "b.png", tasks)
-    assert (tmp_path / "a.png").stat().st_size > 5000 < (tmp_path / "b.png").stat().st_size
+    assert all((tmp_path / f"{name}.png").stat().st_size > 5000 for name in "abc")
 
 
 @pytest.mark.parametrize(("asked", "given"), [([], None), (["--steps", "8192"], "8192")])

@@ -1,6 +1,7 @@
 """Several seeds in one command: mapped they are single runs, vmapped they stay together."""
 
 import json
+import time
 from pathlib import Path
 
 import jax
@@ -11,7 +12,7 @@ from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE, RunError, U
 from purerl.devices import programs
 from purerl.machine import state_arrays
 from purerl.runs import checkpoint, checkpoint_folder
-from purerl.training import console, loop, seeds, writer
+from purerl.training import console, loop, seeds, session, writer
 from tests.training.test_run import ROOT, TOY, digest, folder, lines, start
 
 # Bits are compared with those of runs that are compiled so too.
@@ -37,12 +38,29 @@ def kept(runs: Path, seed: str) -> list[int]:
 
 
 def test_a_mapped_seed_that_fails_is_told_before_the_next_one(tmp_path, monkeypatch, capsys):
-    def fail(_job, group, _programs):
+    def fail(_job, group, _programs, _began):
         raise RunError("It diverged.") if group[0].number == 1 else UserError("Enough.")
 
     monkeypatch.setattr(seeds, "_train_together", fail)
     assert start(tmp_path, "--num-seeds", "2", "--seeds-by", "map") == USAGE
     assert capsys.readouterr().err.splitlines() == ["purerl: It diverged.", "purerl: Enough."]
+
+
+def test_a_runs_clock_begins_with_its_command_or_with_the_seed_before_it(tmp_path, monkeypatch):
+    prepare, ready = session.prepare, []
+
+    def slowly(*arguments):
+        time.sleep(1.0)
+        ready.append(time.perf_counter())
+        return prepare(*arguments)
+
+    monkeypatch.setattr(session, "prepare", slowly)
+    assert start(tmp_path, "--num-seeds", "2", "--seeds-by", "map") == SUCCESS
+    after = time.perf_counter() - ready[0]
+    files = [tmp_path / "toy_experiment" / f"seed{k}" / "metrics.jsonl" for k in (1, 2)]
+    clocks = [[json.loads(line)["wall_s"] for line in file.open()] for file in files]
+    assert clocks[0][0] >= 1.0 and clocks[1][-1] <= after
+    assert clocks[0][-1] + clocks[1][-1] <= after + 1.5
 
 
 @pytest.mark.slow
