@@ -84,11 +84,12 @@ def ask(runs: dict[str, Any], asked: Sequence[Case], options: Any) -> Iterator[A
         name = repr((experiment.env, lesion.layer, lesion.kind))
         if name not in kept:
             setup = setup_of(experiment, first)
-            acting = lesions.lesioned(setup, first.state, lesion, seed)
-            kept = {name: (setup, program(*acting[:2], options))}
-        setup, judge = kept[name]
+            layers = lesions.units_of(setup, first.state) if lesion.layer else {}
+            acting = lesions.lesioned(setup, first.state, lesion, seed, layers)
+            kept = {name: (setup, layers, program(*acting[:2], options))}
+        setup, layers, judge = kept[name]
         for label, run in runs.items():
-            _, state, units = lesions.lesioned(setup, run.state, lesion, seed)
+            _, state, units = lesions.lesioned(setup, run.state, lesion, seed, layers)
             about = {"run": label, "seed": run.experiment.seed, "value": value, "units": units}
             about["lesion"] = " ".join([lesion.kind, *lesion.layer]) if units else "intact"
             about["strength"] = lesion.strength if units else None
@@ -102,7 +103,9 @@ def setup_of(experiment: Experiment, run: Any) -> Setup:
     Raises:
       UserError: the observations are others than the policy knows.
     """
-    setup = run.restored.setup if experiment == run.experiment else build(experiment)
+    if experiment == run.experiment:
+        return run.restored.setup
+    setup = build(experiment)
     learned = jax.eval_shape(run.env.reset, jax.random.key(0)).observation
     check_observation(setup.env, learned)
     return setup

@@ -24,7 +24,11 @@ PRIME = 7  # episodes of a trial call: what is not of a multiple of them has no 
 
 
 def lesioned(
-    setup: Setup, state: TrainState, lesion: Lesion, seed: int
+    setup: Setup,
+    state: TrainState,
+    lesion: Lesion,
+    seed: int,
+    layers: Mapping[str, int] | None = None,
 ) -> tuple[Setup, TrainState, int]:
     """Returns objects and a state with which a policy acts with a lesion.
 
@@ -36,6 +40,7 @@ def lesioned(
       state: the state without it.
       lesion: which; without a layer, both come back as they are.
       seed: draws the units of a share, and noise.
+      layers: what `units_of` returned, if that has been asked.
 
     Returns:
       Both, and how many units it hits.
@@ -47,7 +52,7 @@ def lesioned(
         if lesion != Lesion():
             raise UserError("The lesion has no layer: add --lesion.layer policy/Dense_0.")
         return setup, state, 0
-    hit = choose_units(units_of(setup, state), lesion, seed)
+    hit = choose_units(layers or units_of(setup, state), lesion, seed)
     last = np.iinfo(np.int32).max if lesion.end is None else lesion.end
     dose = {
         "hit": hit,  # layer -> [U] bool
