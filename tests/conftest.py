@@ -19,6 +19,9 @@ COMPILED = os.path.join(tempfile.gettempdir(), "purerl-test-compilations")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", COMPILED)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
+# A fork is refused where a mapping is larger than the memory; a rodent reserves 3 GB, untouched.
+os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
+
 # The list of known experiments; not that of who tests.
 os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="purerl-test-state-")
 atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
