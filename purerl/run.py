@@ -66,8 +66,11 @@ def _train(words: Sequence[str]) -> None:
 
         if is_first():
             shown = render.RenderOptions(run=folders[0], trust=True)
-            if file := _attempt("video", _show_policy, shown):
-                _attempt("video for the loggers", _log_video, options, folders[0], Path(file))
+            file = _attempt("video", _show_policy, shown)
+            if file and options.wandb != "off":
+                from purerl.training import loggers
+
+                _attempt("video at W&B", loggers.log_video, options, folders[0], Path(file))
 
 
 def _show_policy(options: Any) -> str:
@@ -80,14 +83,6 @@ def _show_policy(options: Any) -> str:
     for line in (lines := render.make(options)):
         output.say(line)
     return lines[-1]
-
-
-def _log_video(options: Any, folder: Path, video: Path) -> None:
-    """Hands the video to TensorBoard and W&B, if the run has them."""
-    from purerl.report.video_loggers import log_video
-
-    for line in log_video(options, folder, video, int(video.stem.partition("_")[0])):
-        output.say(line)
 
 
 def _attempt(what: str, part: Callable[..., Any], *arguments: Any) -> Any:

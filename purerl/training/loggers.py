@@ -14,8 +14,8 @@ from typing import Any
 from purerl.core.errors import one_line
 from purerl.experiment.options import RunOptions
 from purerl.machine.command_errors import check_installed
-from purerl.machine.output import Say
-from purerl.runs.folder import Folder
+from purerl.machine.output import Say, say
+from purerl.runs.folder import Folder, read
 from purerl.runs.metrics_file import Record, read_metrics
 
 
@@ -106,6 +106,18 @@ class WandbSink:
         """Sends a record as the step of its update, unless W&B has that step."""
         if record["update"] >= self.run.step:
             self.run.log(record, step=record["update"])
+
+
+def log_video(options: RunOptions, folder: Path, video: Path) -> None:
+    """Goes on with a run at W&B, and logs a video that is named after its update, and its sheet."""
+    import wandb
+
+    sink = WandbSink(read(folder), options.wandb, options.wandb_project)
+    sheet, update = str(video.with_suffix(".png")), int(video.stem.partition("_")[0])
+    shown = {"video": wandb.Video(str(video), format="mp4"), "contact_sheet": wandb.Image(sheet)}
+    sink.run.log(shown | {"update": update}, step=max(update, sink.run.step))
+    sink.close()
+    say(f"W&B has it as {' and '.join(shown)}")
 
 
 def check_loggers(options: RunOptions) -> None:

@@ -99,6 +99,31 @@ def test_what_is_not_the_default_stands_in_the_name(trained, capsys):
     assert re.search(r"evaluation after update 3: return .* in that range: [01] of 1", said)
 
 
+@pytest.mark.parametrize("name", ["a:b%03d.mp4", "http:x.mp4", "-y.mp4", "a[1].mp4"])
+def test_a_video_is_written_whatever_its_name(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    black = (np.zeros((48, 64, 3), np.uint8) for _ in range(3))
+    video._write_video(Path(name), black, 3, (64, 48), 10.0)
+    assert [file.name for file in tmp_path.iterdir()] == [name]
+    assert len(read_video(tmp_path / name)[1]) == 3
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("opengl")
+def test_the_command_hands_its_video_to_wandb(tmp_path, capsys):
+    pytest.importorskip("wandb")
+    words = ["cartpole_swingup", "--runs", str(tmp_path), *TINY.split()]
+    assert run.main([*words, "--video", "--wandb", "offline"]) == 0
+    said, place = capsys.readouterr(), tmp_path / "cartpole_swingup" / "seed1"
+    assert "W&B has it as video and contact_sheet" in said.out, said.err
+    found = [file for file in place.glob("wandb/offline-run-*/files/media/**/*") if file.is_file()]
+    for kind in ("mp4", "png"):
+        (own,) = place.glob(f"videos/*.{kind}")
+        assert [file.read_bytes() for file in found if file.suffix == own.suffix] == [
+            own.read_bytes()
+        ]
+
+
 @pytest.mark.usefixtures("opengl")
 def test_frames_are_had_in_one_call_from_a_camera_by_name_or_number(trained):
     loaded = purerl.load(trained)

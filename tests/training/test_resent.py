@@ -10,8 +10,9 @@ import pytest
 
 from purerl import run
 from purerl.core.errors import SUCCESS, USAGE
+from purerl.experiment.options import RunOptions
 from purerl.runs import checkpoint_folder
-from purerl.training import session
+from purerl.training import loggers, session
 from tests.experiment.test_source_hashes import TOY
 
 WORDS = [str(TOY), "--evaluation.number", "6", "--checkpoints", "2", "--wandb", "offline"]
@@ -25,6 +26,7 @@ class Wandb(types.ModuleType):
     def __init__(self, step: int = 0) -> None:
         self.rows: dict[int, dict] = {}
         self.Settings = dict
+        self.Video, self.Image = lambda path, format: path, lambda path: path
         self.step = step
 
     def init(self, **options):
@@ -73,6 +75,17 @@ def test_a_run_that_goes_on_sends_all_that_the_logger_lacks(trained, tmp_path, m
     assert [*wandb.rows] == [update for update in now if update >= known]
     for update, row in wandb.rows.items():
         assert row | {"wall_s": 0} == now[update] | {"wall_s": 0}
+
+
+def test_a_video_and_its_sheet_are_sent_as_of_their_update(trained, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "wandb", wandb := Wandb(5))
+    options = RunOptions(wandb="offline")
+    for name, step in (("000000000012_side.mp4", 12), ("000000000003.mp4", 12)):  # none before
+        video = trained[0] / "videos" / name
+        loggers.log_video(options, trained[0], video)
+        row = {"video": str(video), "contact_sheet": str(video.with_suffix(".png"))}
+        assert wandb.rows[step] == row | {"update": int(name[:12])}
+    assert "W&B has it as video and contact_sheet" in capsys.readouterr().out
 
 
 def test_the_best_evaluation_has_a_checkpoint(trained):
