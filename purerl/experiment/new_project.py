@@ -1,9 +1,8 @@
 """Writes a project of a person's own: an environment, its body, an experiment and a test."""
 
-import errno
 import keyword
 import os
-import shutil
+import tempfile
 from pathlib import Path
 
 from purerl.core.errors import UserError
@@ -31,8 +30,6 @@ def write_project(folder: Path) -> list[Path]:
     try:
         _write_whole(folder, {file: text.replace("NAME", name) for file, text in _files().items()})
     except OSError as error:
-        if error.errno in (errno.EEXIST, errno.ENOTEMPTY):  # another was faster
-            raise UserError(f"{folder} exists: choose another name, or remove it.") from error
         raise UserError(f"{folder} cannot be written: {error.strerror}.") from error
     return [folder / file for file in _files()]
 
@@ -53,12 +50,9 @@ def _files() -> dict[str, str]:
 
 def _write_whole(folder: Path, files: dict[str, str]) -> None:
     """Writes into a folder beside it first, so that nothing half made stands under its name."""
-    draft = folder.absolute().with_name(f".{folder.name}-{os.urandom(4).hex()}")
-    draft.mkdir()
-    try:
+    with tempfile.TemporaryDirectory(prefix=".", dir=folder.absolute().parent) as place:
+        draft = Path(place, folder.name)
+        draft.mkdir()
         for name, text in files.items():
             (draft / name).write_text(text)
         draft.rename(folder.absolute())
-    except BaseException:
-        shutil.rmtree(draft, ignore_errors=True)
-        raise

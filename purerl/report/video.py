@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -160,20 +161,15 @@ def _write_files(
     path: Path, frames: Iterable[np.ndarray], number: int, size: tuple[int, int], fps: float
 ) -> None:
     """Writes a video of `number` frames and, beside it, its contact sheet; each whole or not."""
-    drafts = {kind: path.with_name(f".{path.stem}{kind}") for kind in (".png", ".mp4")}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for draft in drafts.values():  # it may be a link, to be written through
-            draft.unlink(missing_ok=True)
-        _write_video(drafts[".mp4"], frames, number, size, fps).save(drafts[".png"])
-        for kind, draft in drafts.items():
-            draft.replace(path.with_suffix(kind))
+        with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as place:
+            draft = Path(place, path.name)
+            _write_video(draft, frames, number, size, fps).save(draft.with_suffix(".png"))
+            for kind in (".png", ".mp4"):
+                draft.with_suffix(kind).replace(path.with_suffix(kind))
     except OSError as error:
         raise RunError(f"{path} cannot be written: {one_line(error)}") from error
-    finally:
-        for draft in drafts.values():
-            with contextlib.suppress(OSError):
-                draft.unlink(missing_ok=True)
 
 
 def _write_video(
