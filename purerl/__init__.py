@@ -9,6 +9,7 @@ A name is imported when it is first used: `import purerl` does not start JAX.
 
 import ast
 import importlib
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,54 +27,40 @@ def listed(file: str) -> dict[str, str]:
 def lazy(
     package: str, file: str
 ) -> tuple[dict[str, str], Callable[[str], Any], Callable[[], list[str]]]:
-    """Returns what makes a room import its public names when they are first used.
+    """Returns what makes a package import its public names when they are used.
 
     Args:
-      package: the room's name.
+      package: its name.
       file: its `__init__.py`, which has a stub beside it.
 
     Returns:
-      Its names with their modules, and the room's `__getattr__` and `__dir__`.
+      Its names with their modules, and its `__getattr__` and `__dir__`.
     """
     homes = listed(file)
 
     def get(name: str) -> Any:
         if name not in homes:
-            raise AttributeError(f"{package} has no {name!r}; it has {', '.join(sorted(homes))}.")
-        return getattr(importlib.import_module(homes[name]), name)
+            raise AttributeError(f"{package} has no name {name!r}: {what_to_write(name, package)}.")
+        home = vars(importlib.import_module(homes[name]))
+        # As `from home import name` does: what is no name of the module may be a module in it.
+        return home[name] if name in home else importlib.import_module(f"{homes[name]}.{name}")
 
     return homes, get, lambda: sorted(homes)
 
 
-HOMES = listed(__file__)
+HOMES, __getattr__, __dir__ = lazy(__name__, __file__)
 __all__ = sorted(HOMES)
 
 
-def __getattr__(name: str) -> Any:
-    """Imports a public name when it is first used."""
-    if name not in HOMES:
-        raise AttributeError(f"purerl has no name {name!r}: {what_to_write(name)}.")
-    home = HOMES[name]
-    if home == __name__:
-        return importlib.import_module(f"{home}.{name}")
-    # As `from home import name` does: what is no name of the module may be a module in it.
-    found = getattr(__import__(home, fromlist=[name]), name)
-    return globals().setdefault(name, found)
-
-
-def __dir__() -> list[str]:
-    return [*__all__, "__version__"]
-
-
-def what_to_write(name: str) -> str:
+def what_to_write(name: str, package: str = __name__) -> str:
     """Returns the line to write for a name that was looked for in vain, or the names there are."""
     import difflib
 
-    known = {public.lower(): public for public in __all__}
+    known = {public.lower(): public for public in sys.modules[package].__all__}
     near = difflib.get_close_matches(name.lower(), known, n=1, cutoff=0.7)
     if near:
-        return f"write `from purerl import {known[near[0]]}`"
-    return f"the names to import from purerl are {', '.join(__all__)}"
+        return f"write `from {package} import {known[near[0]]}`"
+    return f"the names to import from {package} are {', '.join(known.values())}"
 
 
 def how_to_install(extra: str) -> str:

@@ -223,8 +223,10 @@ def test_dm_env_tells_the_end_from_the_time_limit():
 def test_mistakes_are_one_line():
     with pytest.raises(purerl.UserError, match="episode_length is 0"):
         adapters.dm_env_environment(Toy(), episode_length=0)
-    with pytest.raises(AttributeError, match="has no 'gymnasium'; it has Brax.*, dm_env_env"):
-        adapters.gymnasium  # noqa: B018
+    with pytest.raises(AttributeError, match="no name 'dm': the names .* Brax.*, dm_env_env"):
+        adapters.dm  # noqa: B018
+    with pytest.raises(AttributeError, match="write `from purerl.adapters import gymnasium_env`"):
+        adapters.gymnasiumenv  # noqa: B018
     pytest.importorskip("gymnasium")
     with pytest.raises(purerl.UserError, match="Toy cannot be drawn"):
         adapters.gymnasium_env(Toy(), render_mode="rgb_array")
