@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from purerl.checks import check_env, examine_physics
-from purerl.checks.findings import Finding, error, ok, some, warning
+from purerl.checks.findings import Finding, error, ok, warning
 from purerl.checks.user_code import in_words, own_line, program_errors
 from purerl.core.env import ABSURD, Env, EnvError, State
-from purerl.core.errors import one_line
+from purerl.core.errors import one_line, some
 from purerl.machine.state_arrays import flatten
 from purerl.physics import reasons
 

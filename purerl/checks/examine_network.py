@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from purerl.checks.findings import Finding, error, ok, some, warning
+from purerl.checks.findings import Finding, error, ok, warning
+from purerl.core.errors import some
 from purerl.core.records import Array, Network, PyTree
 from purerl.machine.state_arrays import flatten
 

@@ -19,9 +19,3 @@ class Finding(NamedTuple):
 ok = functools.partial(Finding, "ok")  # nothing to mend
 warning = functools.partial(Finding, "warning")  # it trains, but probably not as it is meant to
 error = functools.partial(Finding, "error")  # it breaks a rule, or cannot learn
-
-
-def some(names: list[str], most: int = 6) -> str:
-    """Returns names in a line, the first few of many."""
-    rest = len(names) - most
-    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from purerl.clips.records import Clips, Motion, check_rate, shortened
-from purerl.core.errors import UserError
+from purerl.clips.records import Clips, Motion, check_rate
+from purerl.core.errors import UserError, some
 from purerl.physics.drawing import root_body
 
 FREE = int(mujoco.mjtJoint.mjJNT_FREE)
@@ -59,7 +59,7 @@ def poses(motion: Motion, model: mujoco.MjModel, allow: Sequence[str] = ()) -> l
 def _check_joints(offered: dict[str, list], wanted: dict[str, list], allow: set[str]) -> None:
     shared = wanted.keys() & offered.keys()
     if not shared - {ROOT} and shared != wanted.keys():
-        both = f"their joints ({shortened(offered)}) is one of this one's ({shortened(wanted)})"
+        both = f"their joints ({some(offered)}) is one of this one's ({some(wanted)})"
         raise UserError(f"The clips are of another body: none of {both}.")
     sides = {
         "lack joints of the body": [n for n in wanted if n not in offered],
@@ -67,7 +67,7 @@ def _check_joints(offered: dict[str, list], wanted: dict[str, list], allow: set[
         "have other columns for": [n for n in shared if len(wanted[n]) != len(offered[n])],
     }
     odd = {what: [n for n in names if n not in allow] for what, names in sides.items()}
-    if said := [f"{what}: {shortened(names)}" for what, names in odd.items() if names]:
+    if said := [f"{what}: {some(names)}" for what, names in odd.items() if names]:
         told = "; they ".join(said)
         raise UserError(f"The clips {told}. Name in `allow` those that only one of them may have.")
 

@@ -17,8 +17,8 @@ import mujoco
 import numpy as np
 
 from purerl.clips import body
-from purerl.clips.records import Clips, Motion, check_rate, shortened
-from purerl.core.errors import UserError, reason
+from purerl.clips.records import Clips, Motion, check_rate
+from purerl.core.errors import UserError, reason, some
 from purerl.machine import files
 from purerl.machine.command_errors import check_installed
 
@@ -73,7 +73,7 @@ def _array(
     if name not in file:
         there: list[str] = []
         file.visit(there.append)
-        raise UserError(f"{path} lacks {name}; there are: {shortened(there, 30) or 'none'}.")
+        raise UserError(f"{path} lacks {name}; there are: {some(there, 30) or 'none'}.")
     found = np.asarray(file[name])
     if found.ndim != dims or found.shape[: len(begin)] != begin:
         must = f"have {dims} dimensions" + f", the first {list(begin)}" * bool(begin)
@@ -138,7 +138,7 @@ def _check_values(path: Path, motion: Motion) -> None:
     """Raises UserError for names that are not different, wrong lengths, and what is no number."""
     most = motion.values.shape[1]
     if not 0 < len(set(motion.names)) == len(motion.names):
-        raise UserError(f"{path} has clips of one name, or none: {shortened(motion.names)}.")
+        raise UserError(f"{path} has clips of one name, or none: {some(motion.names)}.")
     for name, length, x in zip(motion.names, motion.lengths, motion.values, strict=True):
         if not 1 <= length <= most:
             raise UserError(f"{path}: clip {name!r} has {length} frames; it must be 1 to {most}.")
@@ -167,7 +167,7 @@ def write(path: Path | str, clips: Clips, model: mujoco.MjModel) -> None:
     places = body.joint_places(model)
     root = places.pop(body.ROOT, [])[:1]
     if balls := [name for name, place in places.items() if len(place) > 1]:
-        raise UserError(f"This layout has no ball joints: {shortened(balls)}.")
+        raise UserError(f"This layout has no ball joints: {some(balls)}.")
     joints = [start for start, *_ in places.values()]
     dofs = dict(zip(model.jnt_qposadr.tolist(), model.jnt_dofadr.tolist(), strict=True))
     qpos, qvel = np.asarray(clips.qpos), np.asarray(clips.qvel)

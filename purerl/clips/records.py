@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from purerl.core.errors import UserError, unknown_name
+from purerl.core.errors import UserError, some, unknown_name
 from purerl.core.records import Array
 
 
@@ -44,13 +44,6 @@ def behaviour_of(name: str) -> str:
     'FastWalk'
     """
     return re.sub(r"[\s_/-]*\d*(\.[A-Za-z]\w*)?$", "", name) or name
-
-
-def shortened(names: Iterable[str], most: int = 8) -> str:
-    """Returns names as one text, those after the first `most` as their number."""
-    names = list(names)
-    more = len(names) - most
-    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def check_rate(rate: float) -> None:
@@ -130,4 +123,4 @@ def check_window(clips: Clips, window: int) -> None:
     lengths = zip(clips.names, clips.lengths.tolist(), strict=True)
     if short := [f"{name} ({length})" for name, length in lengths if length < window]:
         clip = f"clips have fewer than the window's {window} frames at {clips.rate:g} Hz"
-        raise UserError(f"{len(short)} of {len(clips.names)} {clip}: {shortened(short)}.")
+        raise UserError(f"{len(short)} of {len(clips.names)} {clip}: {some(short)}.")

@@ -69,6 +69,13 @@ def unknown_name(kind: str, name: str, valid: Iterable[str], where: str = "") ->
     return f"There is no {kind} {name!r}{where}.{hint} There are: {', '.join(valid) or 'none'}."
 
 
+def some(names: Iterable[str], most: int = 6) -> str:
+    """Returns names in a line, those after the first `most` as their number."""
+    every = list(names)
+    rest = len(every) - most
+    return ", ".join(every[:most]) + (f" and {rest} more" if rest > 0 else "")
+
+
 def check_least(owner: Any, refusal: type[Exception], **least: float) -> None:
     """Raises a `refusal` that names the first of an object's numbers that is below its least."""
     for name, number in least.items():

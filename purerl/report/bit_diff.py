@@ -2,11 +2,10 @@
 
 from typing import Any
 
+from purerl.core.errors import some
 from purerl.report.run_reader import RunRecord
 from purerl.runs import checkpoint_folder, manifest
 from purerl.runs.folder import CHECKPOINTS
-
-SHOWN = 3  # differing leaves that are named
 
 
 def compare_bits(a: RunRecord, b: RunRecord) -> dict[str, Any]:
@@ -79,7 +78,6 @@ def _first_leaves_that_differ(a: RunRecord, b: RunRecord) -> tuple[str, list[str
         every = sorted({*ours, *theirs})
         leaves = [leaf for leaf in every if ours.get(leaf) != theirs.get(leaf)]
         if leaves:
-            named = ", ".join(leaves[:SHOWN]) + (", ..." if len(leaves) > SHOWN else "")
-            where = f"leaves differ in the checkpoint of update {update}, the first {named}"
+            where = f"leaves differ in the checkpoint of update {update}: {some(leaves, 3)}"
             return f"{len(leaves)} of {len(every)} {where}", leaves
     return "leaves cannot be compared: the checkpoints that differ are deleted (see --keep)", []

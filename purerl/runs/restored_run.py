@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import jax
 
-from purerl.checks import findings, held_arrays, user_code
-from purerl.core.errors import RunError, UserError, one_line
+from purerl.checks import held_arrays, user_code
+from purerl.core.errors import RunError, UserError, one_line, some
 from purerl.devices import memory, programs
 from purerl.experiment import definition, loading, settings_json, source_hashes
 from purerl.experiment.objects import Setup, build, physics_hash
@@ -101,7 +101,7 @@ def _changed_since(begun: dict[str, Any], source: loading.Source, setup: Setup) 
     edited = [name for name, value in now.items() if then.get(name) != value]
     # The run's own copy of its experiment, `source`, cannot have been edited.
     edited = [name for name in edited if source_hashes.module_file(name) != source.path]
-    found = [f"The code of {findings.some(edited, 3)}"] if edited else []
+    found = [f"The code of {some(edited, 3)}"] if edited else []
     if setup.engine == begun["engine"] and physics_hash(setup.env) != begun["model"]:
         found.append("MuJoCo's model")
     held = begun.get("arrays")  # of older runs there is none

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from purerl.core.errors import UserError
+from purerl.core.errors import UserError, some
 from purerl.experiment import options, settings_json, source_hashes
 from purerl.experiment.definition import Experiment
 from purerl.experiment.loading import Source
@@ -73,8 +73,7 @@ def _how_to_begin(folder: Folder, chosen: Experiment) -> str:
         return "; use --resume to go on, or another --name."
     if len(unlike) == 1 and unlike[0].startswith("ppo.num_steps"):
         return f" ({unlike[0]}); to train longer, copy it first (docs/howto/go_on.md)."
-    more = f", and {len(unlike) - 1} more" if len(unlike) > 1 else ""
-    return f", with other settings ({unlike[0]}{more}); use another --name."
+    return f", with other settings ({some(unlike, 1)}); use another --name."
 
 
 def describe_config(source: Source, chosen: Experiment, schedule: dict[str, Any]) -> dict[str, Any]:

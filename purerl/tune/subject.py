@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from purerl.checks import findings
-from purerl.core.errors import UserError
+from purerl.core.errors import UserError, some
 from purerl.experiment import definition, loading
 from purerl.experiment.command_line import from_command_line, parse
 from purerl.experiment.options import EpisodeOptions, PlayOptions
@@ -85,7 +84,7 @@ def find_runs(words: Sequence[str], prog: str) -> tuple[Subject, dict[str, Any],
     number = next((i for i, word in enumerate(words) if word.startswith("-")), len(words))
     places = [loading.shipped(word) or Path(word) for word in words[:number]]
     records = run_reader.read_runs(places, prog.split(".")[-1])
-    if names := findings.some(list(seed_statistics.differing(records)), 3):
+    if names := some(seed_statistics.differing(records), 3):
         raise UserError(f"The runs differ in {names}; give runs that differ in their seed alone.")
     found = [find([str(x.path), *words[number:]], prog) for x in records]
     paths = [(Path(x.name), x.run) for x in found]

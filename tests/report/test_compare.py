@@ -382,7 +382,7 @@ def test_real_runs_part_at_a_named_leaf(tmp_path, capsys):
     assert "update" not in pair["leaves"] and pair["leaves"] == sorted(pair["leaves"])
     said = capsys.readouterr().out
     # Update 2 has no checkpoint any more: the oldest that both keep shows the leaves.
-    assert f"leaves differ in the checkpoint of update 10, the first {pair['leaves'][0]}" in said
+    assert f"leaves differ in the checkpoint of update 10: {pair['leaves'][0]}" in said
 
 
 def test_runs_are_compared_without_jax(tmp_path):

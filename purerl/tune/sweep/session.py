@@ -8,7 +8,7 @@ from collections.abc import Container, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, UserError
+from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, UserError, some
 from purerl.experiment.loading import Source
 from purerl.experiment.settings_json import to_json
 from purerl.experiment.source_hashes import PACKAGE, source_hashes
@@ -97,9 +97,8 @@ def _check_same(folder: Path, begun: dict[str, Any], now: dict[str, Any]) -> Non
     """Raises UserError unless both describe one sweep; its code is looked at by itself."""
     found = manifest.differences(begun | {"source": now["source"]}, now)
     if found:
-        more = f" (and {len(found) - 1} more)" if found[1:] else ""
         raise UserError(
-            f"The sweep {folder} was begun otherwise: {found[0]}{more}; give the command it was "
+            f"The sweep {folder} was begun otherwise: {some(found, 1)}; give the command it was "
             "begun with, or another --name."
         )
 
@@ -114,10 +113,10 @@ def _check_code(base: Base, begun: dict[str, Any], now: dict[str, str]) -> None:
         return
     runs = (base.folder / base.source.name).glob("*")
     if any(run_folder.read(run).is_begun for run in runs):
-        more = f" and {len(changed) - 1} more" if changed[1:] else ""
         raise UserError(
-            f"The experiment's code has changed since the sweep {base.folder} began: {changed[0]}"
-            f"{more}; put it back, use another --name, or go on all the same with --allow-changes."
+            f"The experiment's code has changed since the sweep {base.folder} began: "
+            f"{some(changed, 1)}; put it back, use another --name, or go on all the same with "
+            "--allow-changes."
         )
 
 
