@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from purerl.core.errors import UserError
 from purerl.experiment.command_line import main_of_words
 from purerl.machine import command_errors, output
 from purerl.tune.subject import PlanOptions, chosen as settings_of, find, show_help
@@ -50,8 +49,6 @@ def command(words: Sequence[str]) -> None:
     session, source, title = opening.open_window(found, chosen, options)
     page = Page(options.host, options.port, title)
     try:
-        if options.port not in (0, page.port):  # viser takes the next one
-            raise UserError(f"Port {options.port} was taken meanwhile: give another, as --port.")
         output.show(f"{title}: open {page.address} in a browser; Ctrl-C ends.")
         play(page, session, source, lambda line: output.show(line))
     except KeyboardInterrupt:

@@ -24,8 +24,8 @@ def option_words(name: str, default: Any, value: Any) -> list[str]:
         return []
     option = name.replace("_", "-")
     if isinstance(default, bool) and isinstance(value, bool):
-        path, _, last = option.rpartition(".")
-        return [f"--{path}.{last if value else f'no-{last}'}"]
+        path, dot, last = option.rpartition(".")
+        return [f"--{path}{dot}{last if value else f'no-{last}'}"]
     parts = value if isinstance(value, list | tuple) else [value]
     texts = [part.name if isinstance(part, enum.Enum) else _text(part) for part in parts]
     return [f"--{option}", *texts]

@@ -13,6 +13,7 @@ from purerl.core.errors import UserError, one_line
 from purerl.experiment import definition, kinds, loading, other_trainers, settings_json
 from purerl.experiment.command_line import WORDS, parse
 from purerl.experiment.options import RunOptions
+from purerl.tune import overrides
 from purerl.tune.option_numbers import Place, replaced
 from purerl.tune.sweep.scheduler import Job
 from purerl.tune.sweep.spaces import Space, Values, parse_space
@@ -150,12 +151,9 @@ def check_evaluated(base: Base, spaces: Sequence[Space], metric: str) -> None:
 def option_words(base: Base, name: str, text: str) -> list[str]:
     """Returns a setting with its value, as words of the run command: a flag has no value."""
     default = _names(base.chosen).get(name, getattr(RunOptions, name.replace("-", "_"), None))
-    if not isinstance(default, bool):
-        return [f"--{name}", *text.split()]
-    if (_bool_word(name, text) == "True") == default:
-        return []
-    *path, last = name.split(".")
-    return [f"--{'.'.join([*path, f'no-{last}' if default else last])}"]
+    if isinstance(default, bool):
+        return overrides.option_words(name, default, _bool_word(name, text) == "True")
+    return [f"--{name}", *text.split()]
 
 
 def job(base: Base, point: Point) -> Job:
