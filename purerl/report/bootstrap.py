@@ -62,11 +62,6 @@ def stratified_probability(xs: Sequence[Values], ys: Sequence[Values]) -> Values
     return np.mean([probability_of_improvement(x, y) for x, y in pairs], axis=0)
 
 
-def center_name(number: int) -> str:
-    """Returns what the interquartile mean of so many values is called."""
-    return "IQM" if number >= LEAST_IQM else "mean"
-
-
 def resample(strata: Sequence[Values], seed: int, number: int) -> list[Values]:
     """Draws whole runs with replacement, R times within each stratum: each [n_k] -> [R, n_k]."""
     generator = np.random.default_rng(seed)

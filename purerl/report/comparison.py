@@ -10,7 +10,7 @@ from purerl.core.errors import UserError
 from purerl.machine.files import as_csv, write_file, write_json, writing
 from purerl.machine.output import printable
 from purerl.report import bit_diff, run_reader, seed_statistics
-from purerl.report.bootstrap import LEAST_IQM, LEAST_RUNS, Interval, center_name
+from purerl.report.bootstrap import LEAST_IQM, LEAST_RUNS, Interval
 from purerl.report.seed_statistics import Curve
 from purerl.runs import manifest
 
@@ -29,6 +29,7 @@ GROUPS_CSV = ["label", "n", "done", "failed", "unfinished", "iqm", "mean", "tent
 GROUPS_CSV += ["worst_run", "low", "high"]
 CURVES_CSV = ["group", "n", "steps", "iqm", "low", "high"]
 MANY = 3  # files of source code that differ, beyond which they are counted
+CURVES = f"Interquartile mean (mean below {LEAST_IQM} seeds), 95% intervals from {LEAST_RUNS} on"
 LONGEST_LABEL = 60  # beside the other columns it fits a wide terminal
 
 
@@ -252,20 +253,6 @@ def draw_curves(path: Path, curves: Sequence[Curve], metric: str) -> None:
             label = printable(f"{curve.label} (n = {len(curve.runs)})")
             axes.plot(curve.steps, iqm, color=color, linewidth=2, label=label)
         axes.plot([], [], color="gray", linewidth=0.5, label="each run")
-        axes.set(xlabel="control steps", ylabel=printable(metric), title=curves_title(curves))
+        axes.set(xlabel="control steps", ylabel=printable(metric), title=CURVES)
         axes.grid(alpha=0.3)
         axes.legend(fontsize="small")
-
-
-def curves_title(curves: Iterable[Curve]) -> str:
-    """Returns the title of a picture of curves: it names what is drawn, and nothing else."""
-    curves = list(curves)
-    with_band = [curve.band.low is not None for curve in curves]
-    names = {center_name(len(curve.runs)) for curve in curves}
-    center = "Mean" if names == {"mean"} else "Interquartile mean"
-    center += f" (below {LEAST_IQM} seeds the mean)" * (len(names) > 1)
-    if all(with_band):
-        return f"{center}, 95% intervals"
-    if any(with_band):
-        return f"{center}, 95% intervals where there are {LEAST_RUNS} seeds or more"
-    return f"{center} (no intervals below {LEAST_RUNS} seeds)"

@@ -103,8 +103,8 @@ def _group_series(group: seed_statistics.Group, metric: str, g: int) -> list[Ser
     if curve is None or len(curve.runs) < 2 or any(visible(run) != run for run in curve.runs):
         return []
     iqm, low, high = (None if a is None else [float(v) for v in a] for a in curve.band)
-    label = f"{bootstrap.center_name(len(curve.runs))} of {len(curve.runs)}"
-    return [Series(label, g, None, curve.steps, iqm or [], low, high)]
+    name = "IQM" if len(curve.runs) >= bootstrap.LEAST_IQM else "mean"
+    return [Series(f"{name} of {len(curve.runs)}", g, None, curve.steps, iqm or [], low, high)]
 
 
 def thin(
