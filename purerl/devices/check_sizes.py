@@ -45,12 +45,6 @@ def check_minibatches(config: Config, recurrent: bool, size: int, name: str = "n
 
 def check_shards(shards: Shards, num_envs: int) -> None:
     """Checks that the devices divide the shards, and the shards the environments."""
-    if shards.number % shards.devices:
-        below = shards.number - shards.number % shards.devices
-        sizes = [str(size) for size in (1, below, below + shards.devices) if size]
-        raise ValueError(
-            f"num_shards = {shards.number} cannot be shared by {shards.devices} devices; "
-            f"num_shards could be {', '.join(dict.fromkeys(sizes))} (1: a single device is used), "
-            "or show fewer devices."
-        )
+    alone = " With num_shards = 1 a single device is used."
+    check_divides("num_shards", shards.number, "devices", shards.devices, alone)
     check_divides("num_envs", num_envs, "num_shards", shards.number)

@@ -3,6 +3,7 @@
 TensorBoard and W&B have threads of their own, for which training never waits.
 """
 
+import contextlib
 import math
 import queue
 import threading
@@ -44,16 +45,12 @@ class BackgroundLogger:
 
     def close(self, timeout: float = 20.0) -> None:
         """Lets what waits be written, for at most `timeout` [s]."""
-        if self.dropped.is_set():
-            return
-        try:
-            self.queue.put(None, timeout=timeout)
-        except queue.Full:
-            self._drop("it is too slow to finish")
-            return
-        self.thread.join(timeout)
-        if self.thread.is_alive():
-            self._drop(f"it did not finish within {timeout:g} s")
+        if not self.dropped.is_set():
+            with contextlib.suppress(queue.Full):
+                self.queue.put(None, timeout=timeout)
+                self.thread.join(timeout)
+            if self.thread.is_alive():
+                self._drop(f"it did not finish within {timeout:g} s")
 
     def _work(self, open_sink: Callable[[], Any]) -> None:
         try:

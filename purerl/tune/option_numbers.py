@@ -54,20 +54,17 @@ def bounds(value: int | float) -> tuple[float, float, float]:
     """
     if isinstance(value, int):
         last = 4 * value or 10
-        return min(0, last), max(0, last), max(1, int(_round_step(abs(last))))
+        return min(0, last), max(0, last), max(1, int(_step(abs(last))))
     if value == 0.0 or not math.isfinite(value):
         return -1.0, 1.0, 0.01
-    step = _round_step(4 * abs(value))
+    step = _step(4 * abs(value))
     end = math.copysign(math.ceil(4 * abs(value) / step - 1e-9) * step, value)
     return min(0.0, end), max(0.0, end), step
 
 
-def _round_step(width: float) -> float:
-    """Returns the greatest of 1, 2, 5 times a power of ten of which 100 fit into `width`."""
-    power = math.floor(math.log10(width / 100))
-    # Parsed, since 10.0**-3 is not the float nearest to 0.001.
-    steps = [float(f"{digit}e{power}") for digit in (1, 2, 5)]
-    return max(step for step in steps if step <= width / 100 * (1 + 1e-9))
+def _step(width: float) -> float:
+    """Returns a step of one digit, of which 100 to 225 fit into `width`."""
+    return float(f"{width / 150:.0e}")
 
 
 def label(place: Place) -> str:
