@@ -57,18 +57,16 @@ def available() -> dict[str, Path]:
 
 def _has_experiment(path: Path) -> bool:
     """Tells whether a file defines an experiment, as other scripts, or an editor's link, do not."""
-    text = b""
     with contextlib.suppress(OSError):
-        text = path.read_bytes()
-    return re.search(rb"^experiment(: *Experiment)? = ", text, re.MULTILINE) is not None
+        return bool(re.search(rb"^experiment(: *Experiment)? = ", path.read_bytes(), re.MULTILINE))
+    return False
 
 
 def summary(path: Path) -> str:
     """Returns the first line of a file's docstring, without running the file."""
-    text = None
     with contextlib.suppress(OSError, SyntaxError, ValueError):
-        text = ast.get_docstring(ast.parse(path.read_bytes()))
-    return text.splitlines()[0] if text else ""
+        return (ast.get_docstring(ast.parse(path.read_bytes())) or "").partition("\n")[0]
+    return ""
 
 
 def find(name: str) -> Experiment:

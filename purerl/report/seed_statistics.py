@@ -71,12 +71,17 @@ def _as_json(**found: Any) -> dict[str, Any]:
     return {k: v._asdict() if isinstance(v, bootstrap.Interval) else v for k, v in found.items()}
 
 
-def check_scored(runs: Iterable[RunRecord], groups: Iterable[Group], metric: str) -> None:
-    """Raises UserError unless some run has the metric, and some run that counts too."""
+def check_metric(runs: Iterable[RunRecord], metric: str) -> None:
+    """Raises UserError, with the nearest name, unless some run has the metric."""
     names = {name for run in runs for line in run.lines for name in line}
     names -= {"update", "steps", "wall_s", "digest"}
     if metric not in names:
         raise UserError(unknown_name("metric", metric, sorted(names), " in these runs"))
+
+
+def check_scored(runs: Iterable[RunRecord], groups: Iterable[Group], metric: str) -> None:
+    """Raises UserError unless some run has the metric, and some run that counts too."""
+    check_metric(runs, metric)
     if not any(_scores(group, metric) for group in groups):
         raise UserError(
             f"No run that is done has a value of {metric}: let one come to its end, or choose "

@@ -3,10 +3,10 @@
 from collections.abc import Iterable, Sequence
 from itertools import cycle
 
-from purerl.core.errors import UserError, unknown_name
+from purerl.core.errors import UserError
 from purerl.report import page_charts, run_reader
-from purerl.report.page_series import metric_names, visible
-from purerl.report.seed_statistics import Curve
+from purerl.report.page_series import visible
+from purerl.report.seed_statistics import Curve, check_metric
 
 MARKS = "*ox+#@%&"
 LEAST_COLUMNS, LEAST_ROWS = 20, 6  # of the field
@@ -15,11 +15,9 @@ LABEL = 10  # columns left of the field
 
 def check_plotted(runs: Sequence[run_reader.RunRecord], metric: str) -> None:
     """Raises UserError unless a run has a value of the metric that can be drawn."""
+    check_metric(runs, metric)
     if not any(visible(run.curve(metric)) for run in runs):
-        names = metric_names(runs)
-        if metric in names:
-            raise UserError(f"{metric} has no finite value in these runs; choose another --metric.")
-        raise UserError(unknown_name("metric", metric, sorted(names), " in these runs"))
+        raise UserError(f"{metric} has no finite value in these runs; choose another --metric.")
 
 
 def draw(curves: Sequence[Curve], metric: str, columns: int, rows: int) -> list[str]:

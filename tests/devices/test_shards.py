@@ -258,8 +258,8 @@ def test_mistakes_end_all_processes(toy, tmp_path):
 def test_sizes_that_do_not_divide(tmp_path):
     rules = [
         ([], "num_shards = 3 does not divide num_envs = 8"),
-        (["--num-shards", "4"], "devices = 3 does not divide num_shards = 4; devices could be 1, 2, 4, "
-         "or num_shards could be 3 or 6. With num_shards = 1 a single device is used."),
+        (["--num-shards", "4"], "devices = 3 does not divide num_shards = 4; devices could be 1, "
+         "2, 4, or num_shards could be 3 or 6. With num_shards = 1 a single device is used."),
         (["--num-shards", "6", "--ppo.num-envs", "12", "--ppo.num-minibatches", "3"],
          "num_minibatches = 3 does not divide num_envs / num_shards * rollout_length = 8"),
         (["--num-shards", "3", "--num-seeds", "2"], "num_shards is 3, and 2 vmapped seeds"),

@@ -87,7 +87,7 @@ def read(words: Sequence[str], prog: str) -> tuple[Problem, Problem | None, Plan
     first = _problem(found, chosen, options)
     if after is None:
         return first, None, options
-    _check_after(after, found, prog)
+    _check_after(after, prog)
     begin = found._replace(source=found.source._replace(experiment=chosen))
     other, _ = subject.chosen(begin, after, f"{prog} {AGAINST}", Nothing, ("env",))
     if other.env == chosen.env:
@@ -114,13 +114,8 @@ def _problem(found: Subject, chosen: definition.Experiment, options: PlanCommand
     )
 
 
-def _check_after(after: Sequence[str], found: Subject, prog: str) -> None:
+def _check_after(after: Sequence[str], prog: str) -> None:
     """Raises UserError for what cannot stand after `--against`."""
-    if not after:
-        raise UserError(
-            f"Nothing stands after {AGAINST}: give other settings of the environment "
-            f"({_example(found.source.experiment.env)})."
-        )
     mine = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(PlanCommandOptions)}
     wrong = next((word for word in after if word.split("=")[0] in mine | {"--engine"}), None)
     if wrong:

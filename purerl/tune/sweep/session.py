@@ -15,6 +15,7 @@ from purerl.experiment.source_hashes import PACKAGE, source_hashes
 from purerl.machine import command_errors, files
 from purerl.machine.lock import FolderLock
 from purerl.machine.output import say, show, warn
+from purerl.report.seed_statistics import check_metric, summarize
 from purerl.runs import folder as run_folder, manifest
 from purerl.tune.sweep import points, scheduler, slurm, spaces, study, table
 from purerl.tune.sweep.options import SweepOptions, read as read_command
@@ -188,10 +189,11 @@ class _Progress:
         self.results.append(result)
         point, metric, score = self.points[result.job.name], self.sweep.options.metric, None
         if result.status == "done":
-            score = table.summarize(table.group_of(self.sweep.base, point), metric)["score"]
+            score = summarize(table.group_of(self.sweep.base, point), metric)["score"]
             told_now = point.name in self.begun or len(self.results) == self.number
             if score is None and told_now:
-                table.check_metric(self.sweep.base, self.points.values(), metric)
+                groups = [table.group_of(self.sweep.base, one) for one in self.points.values()]
+                check_metric([run for group in groups for run in group.runs], metric)
         if self.study is not None and score is not None:
             study.tell(self.study, point, score)
         shown = f": {result.said}" if score is None and result.said else ""

@@ -2,7 +2,7 @@
 
 import contextlib
 import numbers
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ import numpy as np
 from purerl.core.errors import UserError
 from purerl.machine import files, output
 from purerl.report import comparison, run_reader
-from purerl.report.seed_statistics import Group, check_scored, summarize
+from purerl.report.seed_statistics import Group, summarize
 from purerl.tune.sweep.points import Base, Point, job, typed_values
 from purerl.tune.sweep.scheduler import how_it_ended, is_locked
 from purerl.tune.sweep.spaces import Space
@@ -62,13 +62,6 @@ def group_of(base: Base, point: Point) -> Group:
     return Group(point.name, runs)
 
 
-def check_metric(base: Base, points: Iterable[Point], metric: str) -> None:
-    """Raises UserError, with the nearest name, if no run of these points has such a metric."""
-    runs = [run for point in points for run in group_of(base, point).runs]
-    if not any(metric in line for run in runs for line in run.lines):
-        check_scored(runs, [], metric)
-
-
 def _rank(row: Row) -> tuple[Any, ...]:
     score = row.summary["score"]
     place = ORDER.index(row.status) if score is not None else len(ORDER)
@@ -114,11 +107,8 @@ def describe(rows: Sequence[Row], spaces: Sequence[Space], metric: str) -> list[
     lines = [f"{len(rows)} point{'s' * (len(rows) > 1)} ({told}), {metric} at the end"]
     lines += comparison.table(columns, records)
     lines += [f"{row.point.name} failed: {row.said}" for row in rows if row.status == "failed"]
-    return lines + comparison.notes([row.summary for row in rows if _has_runs(row)])
-
-
-def _has_runs(row: Row) -> bool:
-    return any(row.summary[name] for name in ("done", "failed", "unfinished"))
+    found = (row.summary for row in rows)
+    return lines + comparison.notes([s for s in found if s["done"] + s["failed"] + s["unfinished"]])
 
 
 def _shown(text: str) -> str:

@@ -97,7 +97,7 @@ def test_rewards_of_two_settings_are_not_compared():
             ["cartpole_swingup", "--checkpoint", "3"],
             "is an experiment: --checkpoint is for a",
         ),
-        (["cartpole_swingup", "--against"], "Nothing stands after --against: give other settings"),
+        (["cartpole_swingup", "--against"], "The settings after --against are those before it"),
         (
             ["cartpole_swingup", "--against", "--env.substeps", "2"],
             "The settings after --against are those before it",
