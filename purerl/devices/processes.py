@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from purerl.core.errors import FAILURE, RunError, StoppedError, UserError, one_line
-from purerl.core.records import PyTree, is_key
+from purerl.core.records import PyTree
 
 HEARTBEAT = 30  # [s] after which a silent process is given up
 LONGEST = 1 << 16  # [bytes] of what the first process can tell as text
@@ -89,24 +89,6 @@ def of_first(tree: PyTree) -> PyTree:
     from jax.experimental.multihost_utils import process_allgather
 
     return jax.tree.map(lambda x: np.asarray(process_allgather(x))[0], tree)
-
-
-def state_of_first(state: PyTree, abstract: PyTree) -> PyTree:
-    """Returns the first process's state; the others give None."""
-    if jax.process_count() == 1:
-        return state
-
-    def one(like: Any, x: Any) -> Any:
-        raw = jax.eval_shape(jax.random.key_data, like) if is_key(like) else like
-        mine = np.zeros(raw.shape, raw.dtype)
-        if x is not None:
-            mine = np.asarray(jax.random.key_data(x) if is_key(like) else x)
-        found = jax.numpy.asarray(of_first(mine))
-        return jax.random.wrap_key_data(found) if is_key(like) else found
-
-    if state is None:
-        return jax.tree.map(lambda like: one(like, None), abstract)
-    return jax.tree.map(one, abstract, state)
 
 
 def agreed(stop: Callable[[], bool]) -> Callable[[], bool]:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from purerl.checks import examine_env, user_code
 from purerl.core.errors import RunError, UserError
@@ -29,6 +30,7 @@ from purerl.experiment import definition, objects
 from purerl.experiment.options import RunOptions
 from purerl.machine import command_errors, files, output
 from purerl.machine.lock import FolderLock
+from purerl.machine.state_arrays import flatten, leaf_paths, raw, unflatten
 from purerl.ppo.algorithm import start_stage
 from purerl.runs import checkpoint, checkpoint_folder, manifest, resume
 from purerl.runs.folder import CHECKPOINTS, Folder, check_manifest, note
@@ -177,9 +179,18 @@ def _first_state(
 
     if not found:
         drawn = programs.init(together([jax.random.key(seed.number) for seed in seeds]))
-        return processes.state_of_first(put_in(drawn, job.taken or {}), job.abstract)
+        return _of_first(put_in(drawn, job.taken or {}), job.abstract)
     state = together(list(map(_as_it_goes_on, seeds, saved))) if saved else None
-    return processes.state_of_first(state, job.abstract)
+    return _of_first(state, job.abstract)
+
+
+def _of_first(state: TrainState | None, abstract: PyTree) -> Any:
+    """Returns the first process's state, bit for bit; the others may give None."""
+    if jax.process_count() == 1:
+        return state
+    shapes = zip(leaf_paths(abstract), jax.tree.leaves(jax.eval_shape(raw, abstract)), strict=True)
+    mine = flatten(state) if state else {path: np.zeros(x.shape, x.dtype) for path, x in shapes}
+    return unflatten(processes.of_first(mine), abstract)
 
 
 def _as_it_goes_on(seed: Seed, saved: checkpoint.Saved) -> TrainState:
