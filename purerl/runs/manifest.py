@@ -62,7 +62,7 @@ def describe_process(
     return (
         {
             "versions": {"python": platform.python_version(), "libc": "-".join(platform.libc_ver())}
-            | {p: _version(p) for p in packages},
+            | {package: metadata.version(package) for package in packages},
             "device": about,
             "num_shards": num_shards,
             "devices": jax.device_count() if num_shards > 1 else 1,
@@ -129,13 +129,6 @@ def count_files(found: Sequence[str], most: int, remark: str = "") -> list[str]:
     if len(files) <= most:
         return list(found)
     return [line for line in found if line not in files] + [f"source: {len(files)} files{remark}"]
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "absent"
 
 
 def _device_kind(device: Any) -> str:

@@ -1,7 +1,6 @@
 """Settings as the words of a command line that make them; pure."""
 
 import dataclasses
-import enum
 import shlex
 from typing import Any
 
@@ -27,8 +26,7 @@ def option_words(name: str, default: Any, value: Any) -> list[str]:
         path, dot, last = option.rpartition(".")
         return [f"--{path}{dot}{last if value else f'no-{last}'}"]
     parts = value if isinstance(value, list | tuple) else [value]
-    texts = [part.name if isinstance(part, enum.Enum) else _text(part) for part in parts]
-    return [f"--{option}", *texts]
+    return [f"--{option}", *map(_text, parts)]
 
 
 def _text(value: Any) -> str:

@@ -13,6 +13,7 @@ import os
 import platform
 import sys
 from collections.abc import Callable, Iterator
+from importlib import metadata
 from pathlib import Path
 
 from purerl import exact
@@ -78,7 +79,7 @@ def versions() -> Iterator[str]:
     yield f"version python {platform.python_version()}"
     yield f"version libc {' '.join(platform.libc_ver())}"
     for name in (*manifest.PACKAGES, "scipy"):
-        yield f"version {name} {manifest._version(name)}"
+        yield f"version {name} {metadata.version(name)}"
 
 
 def libraries() -> Iterator[str]:
