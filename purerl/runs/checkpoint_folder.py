@@ -16,14 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import UserError, one_line
-from purerl.machine.files import check_plain, hash_file, read_small, sync
+from purerl.machine.files import check_object, check_plain, hash_file, read_small, sync
 
 META = "meta.json"
 KINDS = {
     "update": int, "steps": int, "wall_s": float, "digest": str, "metrics_bytes": int,
     "metrics_sha256": str, "leaves": dict, "files": dict,
 }  # fmt: skip
-LEAF = {"dtype", "shape", "sha256"}
 WRITING, DELETING = ".writing-", ".deleting-"
 
 
@@ -67,20 +66,10 @@ def load_meta(path: Path) -> dict[str, Any]:
         raise DamagedError(f"{META} is cut or overwritten ({type(error).__name__})") from error
     if found != expected:
         raise DamagedError(f"{META} is not what was written (sha256 differs)")
-    _check_kinds(path / META, meta)
+    check_object(str(path / META), meta, **KINDS)
+    for leaf in meta["leaves"].values():
+        check_object(f"{path / META}: leaves", leaf, dtype=str, shape=list, sha256=str)
     return meta
-
-
-def _check_kinds(file: Path, meta: dict[str, Any]) -> None:
-    """Raises UserError if metadata are not laid out as this version of purerl writes them."""
-    wrong = [name for name, kind in KINDS.items() if not isinstance(meta.get(name), kind)]
-    if not wrong and not all(isinstance(x, dict) and {*x} == LEAF for x in meta["leaves"].values()):
-        wrong = ["leaves"]
-    if wrong:
-        raise UserError(
-            f"{file} is of another program or version of purerl: its {wrong[0]} is "
-            f"{meta.get(wrong[0])!s:.60}."
-        )
 
 
 def hash_meta(meta: dict[str, Any]) -> str:

@@ -181,10 +181,8 @@ class Run:
         from purerl.ppo.evaluation import evaluate_policy
 
         check_seed(seed)
-        if not isinstance(episodes, Integral):
-            raise UserError(f"episodes is {episodes!r}; it must be a whole number.")
-        if episodes < 1:
-            raise UserError(f"episodes is {episodes}; it must be at least 1.")
+        if not isinstance(episodes, Integral) or episodes < 1:
+            raise UserError(f"episodes is {episodes!r}; it must be a whole number, at least 1.")
         config, env, network, engine = self.restored.setup
         place, here = self.folder, Path.cwd()
 

@@ -120,7 +120,7 @@ def test_it_evaluates_as_the_command_does(run, tmp_path):
     assert json.loads(file.read_text()) == again
     with pytest.raises(purerl.UserError, match="episodes is 0"):
         run.evaluate(0)
-    with pytest.raises(purerl.UserError, match="episodes is 2.5; it must be a whole number"):
+    with pytest.raises(purerl.UserError, match="episodes is 2.5; it must be a whole n"):
         run.evaluate(2.5)
     for seed in (-1, 2**32):  # JAX would take the one for another
         with pytest.raises(purerl.UserError, match="seed is"):

@@ -206,13 +206,13 @@ def _with_row(session: Session, row: Row, timestep: float) -> Session:
 
 def _end(session: Session, shown: Shown, length: int) -> str:
     """Returns why the episode ends with this step, or ""."""
-    if shown.lost:
-        return "its numbers are NaN or absurd"
-    if shown.terminated:
-        return "terminated"
-    if shown.truncated:
-        return "truncated by the environment"
-    return "time limit" if length >= session.limit else ""
+    ends = {
+        "its numbers are NaN or absurd": shown.lost,
+        "terminated": shown.terminated,
+        "truncated by the environment": shown.truncated,
+        "time limit": length >= session.limit,
+    }
+    return next((why for why, holds in ends.items() if holds), "")
 
 
 def _finished(session: Session, why: str, timestep: float) -> Session:
