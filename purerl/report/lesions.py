@@ -24,11 +24,7 @@ PRIME = 7  # episodes of a trial call: what is not of a multiple of them has no 
 
 
 def lesioned(
-    setup: Setup,
-    state: TrainState,
-    lesion: Lesion,
-    seed: int,
-    layers: Mapping[str, int] | None = None,
+    setup: Setup, state: TrainState, lesion: Lesion, seed: int, layers: Mapping[str, int] = {}
 ) -> tuple[Setup, TrainState, int]:
     """Returns objects and a state with which a policy acts with a lesion.
 

@@ -44,6 +44,14 @@ NO_CHECKPOINT: dict[str, Any] = {"wall_s": 0.0, "update": 0, "metrics_bytes": 0}
 NO_CHECKPOINT |= {"metrics_sha256": hashlib.sha256().hexdigest()}
 
 
+class Call(NamedTuple):
+    """The command, or `train`, that trains."""
+
+    began: float  # by `time.perf_counter` [s]: where `wall_s` is 0
+    stop: Callable[[], bool]  # tells whether a signal asked to stop
+    listener: Callable[[Record], Any] | None = None  # called with each line of metrics
+
+
 class Job(NamedTuple):
     """What the seeds of one command have in common; no disk is read for it."""
 
@@ -54,10 +62,8 @@ class Job(NamedTuple):
     shards: Shards
     plan: Plan
     facts: dict[str, Any]  # what manifest.json says of a run that begins now
-    stop: Callable[[], bool]  # tells whether a signal asked to stop
+    call: Call
     taken: dict[str, Any] | None  # of other runs, for the first state; in the first process
-    began: float = 0.0  # when the command began, by `time.perf_counter` [s]
-    listener: Callable[[Record], Any] | None = None  # called with each line of metrics
 
 
 class Seed(NamedTuple):
@@ -74,7 +80,7 @@ def train_all(job: Job, seeds: list[Seed]) -> None:
     fresh = in_first_process(lambda: not all(s.folder and s.folder.updates for s in seeds))
     programs = functools.cache(lambda: _compile(job, fresh))
     groups = [[seed] for seed in seeds] if job.options.vmapped_seeds == 1 else [seeds]
-    failed, began = [], job.began
+    failed, began = [], job.call.began
     for group in groups:
         try:
             _train_together(job, group, programs, began)
@@ -141,11 +147,12 @@ def _train_together(
                 stack.callback(writer.close)
                 writer.loggers = loggers.open_loggers(job.options, writer.folder, say)
         best = in_first_process(lambda: [writer.best() for writer in writers])
-        stop = processes.agreed(job.stop)
+        stop = processes.agreed(job.call.stop)
         with user_code.program_errors():
             state = compiled.spread(state)
             meta |= {"wall_s": meta["wall_s"] + time.perf_counter() - began}
-            loop.train(job.plan, compiled, state, writers, progress, stop, meta, best, job.listener)
+            told = job.call.listener
+            loop.train(job.plan, compiled, state, writers, progress, stop, meta, best, told)
         for seed, writer in zip(seeds, writers, strict=True):
             of = f" of {seed.path.name}" if job.options.num_seeds > 1 else ""
             say(f"Done: {job.plan.steps:,} steps{of}. Digest {writer.digest}")

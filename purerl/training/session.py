@@ -4,7 +4,7 @@ A seed's folder is a run like any other. It is read when the command begins, and
 lock is held, since another process may have been there in between.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -33,30 +33,22 @@ from purerl.runs.folder import Folder, check_manifest
 from purerl.runs.taken_parts import read_parts
 from purerl.training import console, loggers
 from purerl.training.plan import make_plan
-from purerl.training.seeds import Job, Seed, train_all
+from purerl.training.seeds import Call, Job, Seed, train_all
 
-Stop = Callable[[], bool]  # tells whether a signal asked to stop
+Runs = dict[Path, Experiment]  # each seed's folder, and the experiment with its overrides
 
 
 def execute(
-    source: Source,
-    runs: dict[Path, Experiment],
-    found: Sequence[Folder],
-    options: RunOptions,
-    stop: Stop,
-    began: float,
-    listener: Any = None,
+    source: Source, runs: Runs, found: Sequence[Folder], options: RunOptions, call: Call
 ) -> None:
     """Prepares the folders and the programs, and trains.
 
     Args:
       source: where the experiment came from.
-      runs: each seed's folder, and the experiment with its overrides.
+      runs: what is to be trained.
       found: what each folder held when the command began.
       options: the run's options.
-      stop: tells whether a signal asked to stop.
-      began: when the command began, by `time.perf_counter` [s].
-      listener: called with each line of metrics, or None.
+      call: who trains.
     """
     with processes.fail_together(), ExitStack() as stack:
         processes.start(options.distributed)
@@ -64,13 +56,12 @@ def execute(
         in_first_process(lambda: resume.check_new_or_resume(found, experiments, options.resume))
         loggers.check_loggers(options)
         cache = compilation.set_up_jax(options.cache)
-        job = prepare(source, experiments[0], found, options, stop)
-        job = job._replace(began=began, listener=listener)
+        job = prepare(source, experiments[0], found, options, call)
         train_all(job, begin(source, runs, job, cache, stack))
 
 
 def prepare(
-    source: Source, chosen: Experiment, found: Sequence[Folder], options: RunOptions, stop: Stop
+    source: Source, chosen: Experiment, found: Sequence[Folder], options: RunOptions, call: Call
 ) -> Job:
     """Builds the experiment's objects, and says how they will be trained; arguments as above."""
     with compilation.no_collection():
@@ -82,7 +73,7 @@ def prepare(
     objects.check_memory(setup, abstract, options.vmapped_seeds, shards.devices)
     plan = make_plan(setup.config, chosen.evaluation, options.checkpoints, options.log_every)
     facts = _facts(source, chosen, options, setup, shards) | ({"parts": parts} if parts else {})
-    return Job(options, chosen, setup, abstract, shards, plan, facts, stop, leaves)
+    return Job(options, chosen, setup, abstract, shards, plan, facts, call, leaves)
 
 
 def _taken(found: Sequence[Folder], chosen: Experiment, abstract: PyTree) -> tuple[Any, Any]:
@@ -139,9 +130,7 @@ def _facts(
     return facts
 
 
-def begin(
-    source: Source, runs: dict[Path, Experiment], job: Job, cache: str, stack: ExitStack
-) -> list[Seed]:
+def begin(source: Source, runs: Runs, job: Job, cache: str, stack: ExitStack) -> list[Seed]:
     """Locks each seed's folder, reads it again, and writes down what the run is.
 
     Args:

@@ -111,7 +111,7 @@ def train_runs(
       listener: called with each line of metrics, or None.
     """
     from purerl.runs import folder, manifest
-    from purerl.training.session import execute
+    from purerl.training.session import Call, execute
 
     files.check_name("The experiment's name", source.name)
     if options.name is not None:
@@ -124,7 +124,7 @@ def train_runs(
         set_portable_flags_in_time()
     threads.leave_one(chosen.engine)
     with signals.stop_signals(end) as stop:
-        execute(source, runs, found, options, stop, began, listener)
+        execute(source, runs, found, options, Call(began, stop, listener))
     return list(runs)
 
 
