@@ -4,37 +4,32 @@ from collections.abc import Iterable
 
 from purerl.core.errors import nearest
 
-BONUS = "times the number of actions"
-# Their word -> ours, and how its value becomes ours where it is not the same.
-COUNTERPARTS = {
-    "anneal_lr": ("schedule", "linear if true"),
-    "batch_size": ("num_minibatches", "num_envs * rollout_length / batch_size"),
-    "clip_coef": ("clip", ""),
-    "clip_param": ("clip", ""),
-    "clip_range": ("clip", ""),
-    "clipping_epsilon": ("clip", ""),
-    "discount": ("gamma", ""),
-    "discounting": ("gamma", ""),
-    "ent_coef": ("entropy_weight", BONUS),
-    "entropy_coef": ("entropy_weight", BONUS),
-    "entropy_cost": ("entropy_weight", BONUS),
-    "lam": ("gae_lambda", ""),
-    "max_grad_norm": ("max_gradient_norm", ""),
-    "minibatch_size": ("num_minibatches", "num_envs * rollout_length / minibatch_size"),
-    "n_envs": ("num_envs", ""),
-    "n_epochs": ("num_epochs", ""),
-    "n_steps": ("rollout_length", ""),
-    "num_evals": ("number", "less 1 if it is brax's"),
-    "num_steps_per_env": ("rollout_length", ""),
-    "num_timesteps": ("num_steps", ""),
-    "num_updates_per_batch": ("num_epochs", ""),
-    "ppo_clipping_epsilon": ("clip", ""),
-    "total_timesteps": ("num_steps", ""),
-    "update_epochs": ("num_epochs", ""),
-    "value_loss_coef": ("value_weight", "times 2"),
-    "vf_coef": ("value_weight", "times 2 if it is stable-baselines3's"),
-    "vf_loss_coefficient": ("value_weight", ""),
+# Our word -> theirs.
+THEIRS = {
+    "clip": "clip_coef clip_param clip_range clipping_epsilon ppo_clipping_epsilon",
+    "entropy_weight": "ent_coef entropy_coef entropy_cost",
+    "gae_lambda": "lam",
+    "gamma": "discount discounting",
+    "max_gradient_norm": "max_grad_norm",
+    "num_envs": "n_envs",
+    "num_epochs": "n_epochs num_updates_per_batch update_epochs",
+    "num_minibatches": "batch_size minibatch_size",
+    "num_steps": "num_timesteps total_timesteps",
+    "number": "num_evals",
+    "rollout_length": "n_steps num_steps_per_env",
+    "schedule": "anneal_lr",
+    "value_weight": "value_loss_coef vf_coef vf_loss_coefficient",
 }
+# How a value of theirs becomes ours, where it is not the same.
+CONVERSIONS = dict.fromkeys(THEIRS["entropy_weight"].split(), "times the number of actions") | {
+    "anneal_lr": "linear if true",
+    "batch_size": "num_envs * rollout_length / batch_size",
+    "minibatch_size": "num_envs * rollout_length / minibatch_size",
+    "num_evals": "less 1 if it is brax's",
+    "value_loss_coef": "times 2",
+    "vf_coef": "times 2 if it is stable-baselines3's",
+}
+OURS = {word: ours for ours, words in THEIRS.items() for word in words.split()}
 PAGE = "docs/tutorials/from_other_trainers.md"
 
 
@@ -47,9 +42,9 @@ def suggest(name: str, valid: Iterable[str]) -> str:
     'Did you mean --ppo.num-envs (docs/tutorials/from_other_trainers.md)?'
     """
     valid = list(valid)
-    ours, conversion = COUNTERPARTS.get(_word(name), ("", ""))
+    conversion = CONVERSIONS.get(_word(name), "")
     for one in valid:
-        if _word(one) == ours:
+        if _word(one) == OURS.get(_word(name)):
             return f"Did you mean {one} ({f'{conversion}; ' if conversion else ''}{PAGE})?"
     counts = (one for one in valid if _word(one) == f"num_{_word(name)}")  # seeds, of num_seeds
     near = next(counts, "") or nearest(name, valid)

@@ -163,7 +163,7 @@ def cell(value: Any) -> str:
         low, high = value.values() if isinstance(value, dict) else value
         return f"[{cell(low)}, {cell(high)}]"
     if isinstance(value, float):
-        return f"{value:,.0f}" if abs(value) >= 10_000 else f"{value:.4g}"
+        return f"{value:,.0f}" if 10_000 <= abs(value) < 1e15 else f"{value:.4g}"
     return str(value)
 
 

@@ -97,15 +97,11 @@ def evaluations(runs: Sequence[RunRecord]) -> Html:
     if not every:
         return Html("")
     rows = [
-        [run.path.name, f"{line['steps']:,}", *(_number(line.get(name)) for name in every)]
+        [run.path.name, f"{line['steps']:,}", *(_cut(cell(line.get(name))) for name in every)]
         for run, line in zip(runs, last, strict=True)
         if line
     ]
     return table(["run", "steps", *(name[5:] for name in every)], rows, "numbers")
-
-
-def _number(value: float | None) -> str:
-    return cell(value if value is None else float(value)) if abs(value or 0) < 1e300 else "huge"
 
 
 def settings(runs: Sequence[RunRecord], result: dict[str, Any]) -> list[Html]:

@@ -17,13 +17,17 @@ OURS = [
 PAGE = Path(__file__).parents[2] / other_trainers.PAGE
 
 
-@pytest.mark.parametrize("theirs", other_trainers.COUNTERPARTS)
+@pytest.mark.parametrize("theirs", other_trainers.OURS)
 def test_each_word_has_a_setting_and_is_on_the_page(theirs):
-    ours, conversion = other_trainers.COUNTERPARTS[theirs]
+    ours, conversion = other_trainers.OURS[theirs], other_trainers.CONVERSIONS.get(theirs, "")
     answer = other_trainers.suggest(f"--ppo.{theirs.replace('_', '-')}", OURS)
     assert re.match(rf"Did you mean --\w+\.{ours.replace('_', '-')} \(", answer)
     assert conversion in answer
     assert f"`{theirs}`" in PAGE.read_text()
+
+
+def test_each_conversion_is_of_a_word():
+    assert other_trainers.CONVERSIONS.keys() < other_trainers.OURS.keys()
 
 
 @pytest.mark.parametrize(

@@ -5,14 +5,13 @@ import os
 import shutil
 import signal
 import subprocess
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from purerl.core.errors import INTERRUPTED, UserError, one_line
 from purerl.machine.files import read_json, write_json
-from purerl.tune.sweep.scheduler import POLL, Job, end, is_done, is_locked, start
+from purerl.tune.sweep.scheduler import Job, end, is_done, is_locked, start
 
 FOLDER, IDS = "slurm", "jobs.json"
 # SLURM tells every process of a job that its time is over; a run would die of that signal.
@@ -32,16 +31,14 @@ class Task:
         if is_done(self.job) or is_locked(self.job):
             return "done, or trained by another process"
         self.process = start(self.job, {}, DEAF)
-        while self.process.poll() is None:
-            time.sleep(POLL)
-        return end(self.job, self.process.returncode).status
+        return end(self.job, self.process.wait()).status
 
     def checkpoint(self) -> Any:
         """Saves the runs before the time is over, and puts the job into the queue again."""
         from submitit.helpers import DelayedSubmission
 
         if self.process is not None:
-            # It is called in a signal's handler, which may have come while `poll` holds its lock.
+            # It is called in a signal's handler, which comes while `wait` holds its lock.
             with contextlib.suppress(ProcessLookupError, ChildProcessError):
                 os.kill(self.process.pid, signal.SIGTERM)
                 found = os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOWAIT)
