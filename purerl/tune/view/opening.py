@@ -33,10 +33,10 @@ class Source(NamedTuple):
     """
 
     program: Callable[[Numbers], Any]
-    brain: Callable[[str], tuple[Any, str]]
-    checkpoints: Callable[[], Sequence[str]]
     words: Callable[[Numbers], str]
     command: Callable[[Numbers], str]
+    checkpoints: Callable[[], Sequence[str]] = tuple
+    brain: Any = None  # where there are checkpoints
 
 
 def open_window(subject: Subject, chosen: Experiment, options: Any) -> tuple[Session, Source, str]:
@@ -119,11 +119,7 @@ def _source(
     words = lambda env: shlex.join(overrides.option_words("env", written.env, env))  # noqa: E731
     command = functools.partial(overrides.train_command, name, written, chosen)
     both = (functools.partial(told, words=one) for one in (words, command))
-    return Source(program, _no_brain, tuple, *both)
-
-
-def _no_brain(name: str) -> tuple[Any, str]:
-    raise UserError(f"There is no checkpoint {name}: nothing was trained.")
+    return Source(program, *both)
 
 
 def _open(source: Source, setup: Setup, brain: Any, words: str, options: Any) -> Session:

@@ -55,7 +55,7 @@ class Window:
 
         self.session = self.session._replace(program=program._replace(step=step))
         none = lambda *_: ""  # noqa: E731
-        source = Source(lambda _: self.session.program, none, tuple, none, lambda _: text)
+        source = Source(lambda _: self.session.program, none, lambda _: text)
         self.thread = threading.Thread(target=self._play, args=(source,), daemon=True)
         self.thread.start()
         self.wait(lambda: hasattr(self.page, "said"))
