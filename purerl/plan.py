@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from purerl.experiment.command_line import main_of_words
-from purerl.machine import command_errors, output
+from purerl.machine import command_errors, files, output, signals
 
 PROG = "python -m purerl.plan"
 
@@ -31,8 +31,6 @@ def show_help(words: Sequence[str]) -> None:
 def command(words: Sequence[str]) -> None:
     """Plans, prints the figures, and writes the files that were asked for."""
     from purerl.devices.compilation import set_up_jax
-    from purerl.machine.files import write_answer
-    from purerl.machine.signals import stop_signals
     from purerl.machine.state_arrays import digest_leaves, flatten
     from purerl.report.comparison import episodes_csv
     from purerl.report.opengl import choose_gl
@@ -50,7 +48,7 @@ def command(words: Sequence[str]) -> None:
     problems = [first] if second is None else [first, second]
     judges = {one.title: one.setup.env for one in problems} if second else {}
     played = {}
-    with stop_signals(os._exit, "stopping after the present steps") as stop:
+    with signals.stop_signals(os._exit, "stopping after the present steps") as stop:
         if second is None and first.learned is not None:
             alone = dataclasses.replace(options, **NO_SEARCH, video=None)
             played["policy"] = play(first._replace(title="policy"), alone, {}, stop)
@@ -68,12 +66,12 @@ def command(words: Sequence[str]) -> None:
     whole = {name: x.figures | x.judged for name, x in played.items()}
     if options.csv is not None:
         each = [({"settings": name}, x) for name, x in whole.items()]
-        write_answer(options.csv, episodes_csv(each))
+        files.write_answer(options.csv, episodes_csv(each))
     if options.json is not None:
         about: dict[str, Any] = {"problem": first.name, "trained": first.trained}
         about["environments"] = {one.title: one.settings for one in problems}
         about |= {"engine": first.setup.engine} | dataclasses.asdict(options)
-        write_answer(options.json, figures.as_json(whole, about).encode())
+        files.write_answer(options.json, figures.as_json(whole, about).encode())
 
 
 def titles(problems: Sequence[Any]) -> list[str]:

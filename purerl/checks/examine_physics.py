@@ -15,6 +15,9 @@ from purerl.checks.check_env import Trial
 from purerl.checks.findings import Finding, error, ok, warning
 from purerl.core.env import State
 from purerl.core.records import Array
+from purerl.physics import lookup
+from purerl.physics.changes import ZERO_ROTATION, has_zero_rotation, idle_rows
+from purerl.physics.interface import Physics
 
 TINY = 1e-5  # of a range: what rounding may do
 FAR = 0.05  # [rad or m] from where a servo holds
@@ -65,8 +68,6 @@ def step_calls(env: Any, state: State, action: Array) -> list[Call]:
 
 def check_controls(env: Any, trial: Trial) -> Iterator[Finding]:
     """Warns of controls that MuJoCo clamps: what lies beyond is an action without effect."""
-    from purerl.physics import lookup
-
     model = env.physics.model
 
     def controls(state: State, action: Array) -> list[Array]:
@@ -135,8 +136,6 @@ class Begun(NamedTuple):
 
 def _find_zeros(physics: Any, begun: Begun) -> Iterator[Finding]:
     """Finds quaternions of zeros."""
-    from purerl.physics.changes import ZERO_ROTATION, has_zero_rotation
-
     changes = begun.given.get("changes") or {}
     for i, qpos in enumerate(begun.given["qpos"]):
         if has_zero_rotation(physics.model, qpos, {n: x[i] for n, x in changes.items()}):
@@ -161,9 +160,6 @@ def _find_moved(begun: Begun) -> Iterator[Finding]:
 
 def _find_unheld(physics: Any, begun: Begun) -> Iterator[Finding]:
     """Finds position servos that the first step holds near their place, and init does not."""
-    from purerl.physics import lookup
-    from purerl.physics.interface import Physics
-
     model, step = physics.model, begun.later.get("ctrl")
     servo = (model.actuator_biasprm[:, 1] != 0) & (model.actuator_dyntype == 0)
     servo &= (model.actuator_ctrlnum == 1) & (model.actuator_outnum == 1)
@@ -188,8 +184,6 @@ def _find_unheld(physics: Any, begun: Begun) -> Iterator[Finding]:
 
 def check_changes(physics: Any, begun: Begun) -> Iterator[Finding]:
     """Finds changes of the model that are half, that cannot act, or that a call forgets."""
-    from purerl.physics.changes import idle_rows
-
     own, found = physics.model, dict[str, Any]()
     for call, more in (("init", begun.given), ("step", begun.later)):
         changes = found[call] = more.get("changes") or {}
@@ -216,8 +210,6 @@ def check_changes(physics: Any, begun: Begun) -> Iterator[Finding]:
 
 def check_ranges(model: Any) -> Iterator[Finding]:
     """Warns of joints' ranges of angles that look like degrees read as radians, or the reverse."""
-    from purerl.physics import lookup
-
     turns = np.abs(model.jnt_range).max(1, initial=0.0) * model.jnt_limited  # [njnt] [rad]
     turns[model.jnt_type == SLIDE] = 0.0
     small = (turns > 0) & (turns < SMALL)
@@ -232,7 +224,6 @@ def check_ranges(model: Any) -> Iterator[Finding]:
 
 def check_solver(env: Any, trial: Trial) -> Iterator[Finding]:
     """Compares control steps with those of a solver of many more iterations, both of MuJoCo's C."""
-    from purerl.physics.interface import Physics
 
     def after(model: Any) -> np.ndarray:
         step = Physics(model, (), physics.substeps, "c").step

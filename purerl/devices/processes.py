@@ -113,12 +113,9 @@ def fail_together() -> Iterator[None]:
     except BaseException as error:
         if jax.process_count() == 1:
             raise
-        print(
-            f"purerl: process {jax.process_index()} of {jax.process_count()} cannot go on, or "
-            f"another is gone: {one_line(error)[:300]} Start all of them again, with --resume.",
-            file=sys.stderr,
-            flush=True,
-        )
+        what = f"process {jax.process_index()} of {jax.process_count()} cannot go on, or another is"
+        cure = "Start all of them again, with --resume."
+        print(f"purerl: {what} gone: {one_line(error)[:300]} {cure}", file=sys.stderr, flush=True)
         os._exit(FAILURE)
 
 

@@ -12,7 +12,7 @@ import tyro
 
 from purerl.core.errors import UserError
 from purerl.experiment.command_line import main_of
-from purerl.machine import command_errors, output
+from purerl.machine import command_errors, files, output
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,6 @@ class ReportOptions:
 
 def command(options: ReportOptions) -> None:
     """Writes the page, and prints where it is."""
-    from purerl.machine.files import write_answer
     from purerl.report.page import make_page
     from purerl.report.run_reader import read_runs
 
@@ -35,7 +34,7 @@ def command(options: ReportOptions) -> None:
         raise UserError(f"{options.out} is a folder: give a file, as --out report.html.")
     runs = read_runs(options.runs, "report")
     page = make_page(runs).encode()
-    write_answer(options.out, page)
+    files.write_answer(options.out, page)
     number = f"{len(runs)} run{'s' * (len(runs) > 1)}"
     output.show(f"{options.out} ({number}, {len(page):,} bytes): open it in a browser")
 

@@ -23,6 +23,7 @@ from purerl.experiment.loading import Source, find_source
 from purerl.experiment.options import RunOptions, TrainOptions, check_seed
 from purerl.experiment.source_hashes import hash_code
 from purerl.machine import files, output, signals
+from purerl.runs import checkpoint_folder, folder, manifest
 from purerl.runs.loaded_run import Run
 
 
@@ -110,7 +111,6 @@ def train_runs(
       began: when the command began, by `time.perf_counter` [s]: where `wall_s` is 0.
       listener: called with each line of metrics, or None.
     """
-    from purerl.runs import folder, manifest
     from purerl.training.session import Call, execute
 
     files.check_name("The experiment's name", source.name)
@@ -138,8 +138,6 @@ def as_begun(source: Source, over: command_line.Over) -> tuple[Experiment, RunOp
       source: the experiment.
       over: returns an experiment, and options by name, with what the command line has instead.
     """
-    from purerl.runs import checkpoint_folder, folder, manifest
-
     known = chosen, options = over(source.experiment)
     if not options.resume or options.debug:
         return known
@@ -191,12 +189,11 @@ def set_xla_flags_in_time() -> None:
 
 def set_portable_flags_in_time() -> None:
     """Sets what makes bits portable; UserError where this processor or process cannot have them."""
-    from purerl.runs.manifest import processor
-
-    if not {"avx2", "fma"} <= set(processor("flags").split()):
+    if not {"avx2", "fma"} <= set(manifest.processor("flags").split()):
         raise UserError(
             "Portable bits are those of x86-64 processors with AVX2 and FMA, and this one "
-            f"({processor('model name') or platform.machine()}) has not both; leave out --portable."
+            f"({manifest.processor('model name') or platform.machine()}) has not both; leave out "
+            "--portable."
         )
     if threads.jax_has_begun() and not xla_flags.is_portable():
         raise UserError(
