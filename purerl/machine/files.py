@@ -119,12 +119,14 @@ def parse(where: str, text: bytes) -> Any:
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Turns a disk's refusal of what is written to `path` into a UserError."""
+def writing(path: Path | None = None) -> Iterator[None]:
+    """Turns a disk's refusal of what is written to `path`, None: for a run, into a UserError."""
     try:
         yield
     except OSError as error:
-        raise UserError(f"{path} cannot be written: {error.strerror}.") from error
+        where = path or error.filename or "The folder of the run"
+        what = "written" if path else "read or written"
+        raise UserError(f"{where} cannot be {what}: {error.strerror or error}.") from error
 
 
 def write_json(path: Path, value: dict[str, Any]) -> None:
@@ -247,16 +249,6 @@ def hash_file(path: Path) -> str:
 def draft_of(path: Path) -> Path:
     """Returns the file that holds what `path` will hold once it is whole."""
     return path.with_name(f".{path.name}.draft")
-
-
-@contextlib.contextmanager
-def disk_errors() -> Iterator[None]:
-    """Turns a disk's refusal of what a run needs at its beginning into a UserError."""
-    try:
-        yield
-    except OSError as error:
-        where = error.filename or "The folder of the run"
-        raise UserError(f"{where} cannot be read or written: {error.strerror or error}.") from error
 
 
 # --- names, and what may stand in a folder ---

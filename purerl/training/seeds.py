@@ -121,7 +121,7 @@ def _train_together(
         if processes.is_first():
             progress = stack.enter_context(console.progress(job.plan.updates))
         say = progress.say
-        saved = kept_by_first(files.disk_errors()(lambda: _newest(job, seeds, say))) or []
+        saved = kept_by_first(files.writing()(lambda: _newest(job, seeds, say))) or []
         last = saved[0].meta if saved else NO_CHECKPOINT
         about = {name: last[name] for name in ("wall_s", "update")}
         found, meta = in_first_process(lambda: (bool(saved), about))
@@ -139,7 +139,7 @@ def _train_together(
             say(str(finding))
         writers: list[Any] = [processes.Silent(seed.path / CHECKPOINTS) for seed in seeds]
         if processes.is_first():
-            with files.disk_errors():
+            with files.writing():
                 exactness = manifest.with_unordered(job.facts, _unordered(compiled))
                 seeds = [s._replace(folder=note(s.folder, **exactness)) for s in seeds if s.folder]
                 writers = _open_writers(seeds, saved, job, say)

@@ -141,7 +141,7 @@ def begin(source: Source, runs: Runs, job: Job, cache: str, stack: ExitStack) ->
       stack: gives the locks back at its end.
     """
 
-    @files.disk_errors()
+    @files.writing()
     def locked() -> list[Seed]:
         locks = []
         for path in runs:
