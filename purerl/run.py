@@ -20,10 +20,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from purerl import render
 from purerl.core.errors import SUCCESS, StoppedError, one_line
 from purerl.experiment import loading
 from purerl.experiment.command_line import main_of_words, read_experiment
 from purerl.machine import command_errors, output
+from purerl.report.opengl import choose_gl
 
 
 def show_help(words: Sequence[str]) -> None:
@@ -52,9 +54,7 @@ def command(words: Sequence[str]) -> int:
 def _train(words: Sequence[str]) -> None:
     """Parses, trains, and with --video shows the policy of the first seed."""
     began = time.perf_counter()
-    from purerl import render
-    from purerl.report.opengl import choose_gl
-    from purerl.training import train
+    from purerl.training import loggers, train
 
     train.set_xla_flags_in_time()
     source, chosen, options = read_experiment(words, "python -m purerl.run", choose=train.as_begun)
@@ -68,8 +68,6 @@ def _train(words: Sequence[str]) -> None:
             shown = render.RenderOptions(run=folders[0], trust=True)
             file = _attempt("video", _show_policy, shown)
             if file and options.wandb != "off":
-                from purerl.training import loggers
-
                 _attempt("video at W&B", loggers.log_video, options, folders[0], Path(file))
 
 
@@ -78,8 +76,6 @@ def _show_policy(options: Any) -> str:
 
     Training has ended, and nothing that cannot be printed is a failure of it.
     """
-    from purerl import render
-
     for line in (lines := render.make(options)):
         output.say(line)
     return lines[-1]

@@ -82,10 +82,7 @@ def read_experiment(
       UserError: there is no such experiment or option, or a value is wrong.
     """
     if words[0].startswith("-"):
-        raise UserError(
-            f"The first word must be the experiment, not {words[0]!r}: {prog} EXPERIMENT "
-            "[--option value ...]"
-        )
+        raise UserError(f"The first word must be the experiment, not {words[0]}: {prog} EXPERIMENT")
     source = find_source(words[0])
     prog = f"{prog} {shlex.quote(words[0])}"
     return source, *from_command_line(source, words[1:], prog, base=base, **more)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
 from purerl.core.errors import UserError
-from purerl.experiment import loading
+from purerl.experiment import loading, options
 from purerl.runs.folder import METRICS, check_is_run
 from purerl.runs.metrics_file import deviation, read_metrics
 
@@ -177,10 +177,9 @@ class Run:
         import numpy as np
 
         from purerl.core.keys import Purpose, derive
-        from purerl.experiment.options import check_seed
         from purerl.ppo.evaluation import evaluate_policy
 
-        check_seed(seed)
+        options.check_seed(seed)
         if not isinstance(episodes, Integral) or episodes < 1:
             raise UserError(f"episodes is {episodes!r}; it must be a whole number, at least 1.")
         config, env, network, engine = self.restored.setup
