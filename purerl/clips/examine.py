@@ -40,15 +40,11 @@ def worst(values: np.ndarray, names: list[str], what: str) -> str:
     return f"{largest:.2f} {what}" + f" ({names[number]}, frame {frame})" * (largest > 0)
 
 
-def floor(model: mujoco.MjModel) -> np.ndarray:
-    """Returns which geoms stand still and can be touched, [ngeom] bool."""
-    touched = (model.geom_contype | model.geom_conaffinity) != 0
-    return touched & (model.body_weldid[model.geom_bodyid] == 0)
-
-
 def below_floor(model: mujoco.MjModel, qpos: np.ndarray) -> body.Measure:
     """Returns how deep each geom is in what stands still [mm]."""
-    still, deep = floor(model), np.zeros((len(qpos), model.ngeom))
+    still = (model.geom_contype | model.geom_conaffinity) != 0  # what can be touched, of that:
+    still &= model.body_weldid[model.geom_bodyid] == 0
+    deep = np.zeros((len(qpos), model.ngeom))
     for row, data in zip(deep, body.posed(model, qpos), strict=True):
         mujoco.mj_collision(model, data)
         pairs = data.contact.geom

@@ -126,12 +126,8 @@ def portable(function: Callable) -> Callable:
 def start(name: str, traced: Any) -> Future[tuple[Any, float]]:
     """Compiles a traced program in a thread of its own; the future has it, and the seconds."""
     begin, lowered = time.perf_counter(), traced.lower()
-
-    def compile_it() -> tuple[Any, float]:
-        return lowered.compile(), time.perf_counter() - begin
-
     pool = ThreadPoolExecutor(1, f"purerl-compile-{name}")
-    future = pool.submit(compile_it)
+    future = pool.submit(lambda: (lowered.compile(), time.perf_counter() - begin))
     pool.shutdown(wait=False)
     return future
 

@@ -19,6 +19,7 @@ from purerl.experiment import settings_json
 from purerl.experiment.definition import Experiment, Part
 from purerl.experiment.kinds import wrong_value
 from purerl.experiment.network_parts import with_parts
+from purerl.physics import interface, lookup
 from purerl.ppo import episodes, networks
 from purerl.ppo.config import Config
 from purerl.ppo.learner import is_recurrent
@@ -37,9 +38,6 @@ class Setup(NamedTuple):
 
 def build(chosen: Experiment) -> Setup:
     """Calls the builders; what breaks a rule, of the settings or the protocols, is a UserError."""
-    # Imported here, as below: `compare` reads runs, and needs no MuJoCo.
-    from purerl.physics.interface import choose_engine
-
     _check_jax()
     if wrong := wrong_value(chosen):
         raise UserError(f"The experiment's {wrong}")
@@ -47,7 +45,7 @@ def build(chosen: Experiment) -> Setup:
     check_takes("build_network", chosen.build_network, "options", "observation", "action_size")
     threads.leave_one(chosen.engine)
     with users_errors(""):
-        engine = choose_engine(chosen.engine)
+        engine = interface.choose_engine(chosen.engine)
     with users_errors("build_env: "):
         env = chosen.build_env(chosen.env, engine)
     if env is None:
@@ -292,6 +290,4 @@ def physics_hash(env: Env) -> str | None:
     model = getattr(getattr(env, "physics", None), "model", None)
     if model is None:
         return None
-    from purerl.physics.lookup import hash_model
-
-    return hash_model(model)
+    return lookup.hash_model(model)

@@ -48,7 +48,7 @@ def draw(curves: Sequence[Curve], metric: str, columns: int, rows: int) -> list[
     end = f"{page_charts.short(last)} steps"
     lines.append(f"{'':{LABEL}} 0{end:>{columns - 1}}")
     legend = zip(curves, cycle(MARKS), strict=False)
-    return lines + [f"  {mark}  {c.label} ({_count(c.runs)})" for c, mark in legend]
+    return lines + [f"  {mark}  {c.label} (n = {len(c.runs)})" for c, mark in legend]
 
 
 def _columns(
@@ -61,7 +61,3 @@ def _columns(
             yield column, y + (y_next - y) * max(0.0, column - x) / (x_next - x)
     for x, y in known[-1:]:
         yield round(x), y
-
-
-def _count(runs: Sequence[object]) -> str:
-    return f"{len(runs)} run{'s' * (len(runs) != 1)}"

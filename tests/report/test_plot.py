@@ -31,7 +31,7 @@ def test_a_straight_line_is_straight_and_as_wide_as_the_terminal(tmp_path, termi
     slope, start = np.polyfit(heights[:, 0], heights[:, 1], 1)
     assert slope > 0 and np.abs(heights[:, 1] - slope * heights[:, 0] - start).max() < 0.8
     assert lines[15].endswith("-" * 49) and lines[16].endswith("400 steps")
-    assert lines[17] == "  *  walk (1 run)"
+    assert lines[17] == "  *  walk (n = 1)"
     assert "".join(lines).isascii()
 
 
@@ -40,8 +40,8 @@ def test_groups_have_marks_and_unfinished_runs_are_drawn(tmp_path, terminal, cap
     make_run(tmp_path / "runs" / "b", 1, [5.0, 6.0], rate=1.0)
     assert plot.main([str(tmp_path / "runs"), "--out", str(tmp_path / "f.png")]) == 0
     said = capsys.readouterr().out
-    assert "*  ppo.learning_rate=0.001 (2 runs)" in said
-    assert "o  ppo.learning_rate=1.0 (1 run)" in said and said.count("o") > 20
+    assert "*  ppo.learning_rate=0.001 (n = 2)" in said
+    assert "o  ppo.learning_rate=1.0 (n = 1)" in said and said.count("o") > 20
     for kind, begins in ((".pdf", b"%PDF"), (".svg", b"<?xml")):
         assert plot.main([str(tmp_path / "runs"), "--out", str(tmp_path / f"f{kind}")]) == 0
         assert (tmp_path / f"f{kind}").read_bytes().startswith(begins)
@@ -64,7 +64,7 @@ def test_a_narrow_terminal_is_no_fault(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "1")
     monkeypatch.setenv("LINES", "1")
     assert plot.main([str(make_run(tmp_path / "a", 1, [1.0, 2.0]))]) == 0
-    assert "*" in capsys.readouterr().out.partition("(1 run)")[0]
+    assert "*" in capsys.readouterr().out.partition("(n = 1)")[0]
 
 
 def test_a_mistake_is_one_line(tmp_path, capsys):
