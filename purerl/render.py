@@ -62,9 +62,7 @@ def _parse_size(size: str) -> tuple[int, int]:
         raise UserError(f"size is {size!r}; give width x height in pixels, such as 640x480.")
     width, height = map(int, parts.groups())
     if width % 2 or height % 2 or not 16 <= min(width, height) <= max(width, height) <= 4096:
-        raise UserError(
-            f"size is {size}; width and height must be even and from 16 to 4096 pixels."
-        )
+        raise UserError(f"size is {size}; width and height must be even, 16 to 4096 pixels.")
     return width, height
 
 

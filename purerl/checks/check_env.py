@@ -142,9 +142,7 @@ def check_fields(state: Any) -> None:
     if not isinstance(state.metrics, dict):
         raise EnvError(f"metrics is a {type(state.metrics).__name__}: it must be a dict.")
     for name in sorted(RESERVED & state.metrics.keys()):
-        raise EnvError(
-            f"metrics has the name {name!r}, which is the trainer's own: give the metric another."
-        )
+        raise EnvError(f"metrics has {name!r}, a name of the trainer's: give the metric another.")
     scalars |= {f"metrics[{name!r}]": (x, jnp.float32) for name, x in state.metrics.items()}
     for name, (value, dtype) in scalars.items():
         if not hasattr(value, "dtype") or value.shape != () or value.dtype != dtype:
@@ -184,9 +182,7 @@ def _check_same(reset: dict[str, str], step: dict[str, str]) -> None:
     """Names, shapes and dtypes must not depend on where a state came from, or scan fails."""
     for name in sorted(reset.keys() ^ step.keys()):
         where = "reset" if name in reset else "step"
-        raise EnvError(
-            f"{name} is in the state of {where} only: reset and step must return the same fields."
-        )
+        raise EnvError(f"{name} is in {where}'s state only: reset and step return the same fields.")
     for name, spec in reset.items():
         if spec != step[name] and "weakly" in spec + step[name]:
             raise EnvError(

@@ -124,9 +124,7 @@ def _speeds(setup: Setup, start: State) -> Iterator[Finding]:
 
     step = _seconds(lambda: steps(start, 1))
     length = timed_steps(config, step)
-    what = (
-        f"a control step of {config.num_envs} environments takes {step:.2g} s, so timing {length}"
-    )
+    what = f"a control step of {config.num_envs} environments takes {step:.2g} s: timing {length}"
     yield ok("speed", f"{what} takes about {ROLLOUTS * length * step:.0f} s, and compiling")
     alone = _seconds(lambda: steps(start, length)) / length
     yield ok("speed", f"{config.num_envs / alone:,.0f} steps/s of the environments alone")

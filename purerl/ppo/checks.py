@@ -48,9 +48,7 @@ def check_budget(config: Any) -> None:
         wrong, cure = "less than one update", "raise num_steps or lower"
         if config.num_updates:
             wrong, cure = "2**31 updates or more", "lower num_steps or raise"
-        raise ValueError(
-            f"num_steps is {config.num_steps}, {wrong} of {size}; {cure} one of the two."
-        )
+        raise ValueError(f"num_steps is {config.num_steps}, {wrong} of {size}; {cure} one of them.")
 
 
 def check_observation(observation: "PyTree") -> None:

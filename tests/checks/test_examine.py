@@ -217,7 +217,7 @@ def test_speed_is_measured_only_when_asked(monkeypatch):
     quick, timed = (list(examine.examine(experiment, speed)) for speed in (False, True))
     assert timed[: len(quick)] == quick
     told, alone, update = (one.text for one in timed[len(quick) :])
-    assert told.endswith("takes 0.01 s, so timing 4 takes about 0 s, and compiling")
+    assert told.endswith("takes 0.01 s: timing 4 takes about 0 s, and compiling")
     assert alone == "64 steps/s of the environments alone"
     assert update.startswith("16 steps/s in an update of 2.00 s: 12 updates take 0.4 min")
 

@@ -124,7 +124,7 @@ def build("""
 BROKEN = [
     ("terminated=jnp.zeros(())", 1, "terminated is bool [] from reset and float32 [] from step"),
     ("observation=jnp.zeros(6)", 1, "observation is float32 [5] from reset and float32 [6]"),
-    ("metrics={'upright': jnp.zeros(2)}", 1, "metrics['centered'] is in the state of reset only"),
+    ("metrics={'upright': jnp.zeros(2)}", 1, "metrics['centered'] is in reset's state only"),
     ("reward=state.reward", 0, "env.action_size is 0: it must be a positive int"),
 ]
 
