@@ -6,14 +6,11 @@ RUN is a run's folder; nothing else is needed, and nothing in it is changed.
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from purerl.experiment.command_line import main_of
 from purerl.experiment.options import PlayOptions
 from purerl.machine import command_errors, files, output
-
-if TYPE_CHECKING:
-    from purerl.runs.loaded_run import Evaluated
+from purerl.runs.loaded_run import Evaluated, load
 
 
 @dataclass(frozen=True)
@@ -30,8 +27,6 @@ class EvaluateOptions(PlayOptions):
 
 def command(options: EvaluateOptions) -> None:
     """Evaluates, prints the figures, and writes the file that was asked for."""
-    from purerl.runs.loaded_run import load
-
     file = options.json
     if file is not None:
         files.check_writable(file)
@@ -42,7 +37,7 @@ def command(options: EvaluateOptions) -> None:
         files.write_answer(file, (json.dumps(result, indent=2) + "\n").encode())
 
 
-def describe(result: "Evaluated") -> list[str]:
+def describe(result: Evaluated) -> list[str]:
     """Returns the result as lines for a person, the return first."""
     ordered = {"episode_return": result["metrics"]["episode_return"]} | result["metrics"]
     width = max(map(len, ordered))

@@ -69,16 +69,14 @@ class FolderLock:
     def check(self) -> None:
         """Raises RunError if the folder is no longer where it was."""
         try:
-            if os.path.samestat(os.fstat(self.handles[0]), os.stat(self.folder)):
-                return
-        except FileNotFoundError:
-            pass
-        except OSError:  # it may be there: what is written next will tell
-            return
-        raise RunError(
-            f"The run's folder {self.folder} has been moved or removed while it trained; nothing "
-            "more can be saved there. Move it back, and go on with --resume."
-        )
+            there = os.path.samestat(os.fstat(self.handles[0]), os.stat(self.folder))
+        except OSError as error:  # of another kind: what is written next will tell
+            there = not isinstance(error, FileNotFoundError)
+        if not there:
+            raise RunError(
+                f"The run's folder {self.folder} has been moved or removed while it trained; "
+                "nothing more can be saved there. Move it back, and go on with --resume."
+            )
 
     def close(self) -> None:
         """Gives the lock back."""

@@ -180,8 +180,7 @@ def _write_video(
     os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
     import imageio_ffmpeg
 
-    last_cell = SHEET * SHEET - 1  # the cells show moments evenly spaced, first and last included
-    shown = [round(cell * (number - 1) / last_cell) for cell in range(last_cell + 1)]
+    shown = np.linspace(0, number - 1, SHEET * SHEET).round()  # in each cell, the frame's number
     width, height = SHEET_WIDTH, round(SHEET_WIDTH * size[1] / size[0])
     sheet = Image.new("RGB", (SHEET * width, SHEET * height))
     writer = imageio_ffmpeg.write_frames(
@@ -192,7 +191,7 @@ def _write_video(
     try:
         for i, frame in enumerate(frames):
             writer.send(np.ascontiguousarray(frame))
-            for cell in (cell for cell, moment in enumerate(shown) if moment == i):
+            for cell in np.flatnonzero(shown == i).tolist():
                 image = Image.fromarray(frame).resize((width, height))
                 sheet.paste(image, (cell % SHEET * width, cell // SHEET * height))
     finally:

@@ -19,10 +19,6 @@ from purerl.core.errors import UserError, one_line
 from purerl.machine.files import check_object, check_plain, hash_file, read_small, sync
 
 META = "meta.json"
-KINDS = {
-    "update": int, "steps": int, "wall_s": float, "digest": str, "metrics_bytes": int,
-    "metrics_sha256": str, "leaves": dict, "files": dict,
-}  # fmt: skip
 WRITING, DELETING = ".writing-", ".deleting-"
 
 
@@ -66,7 +62,10 @@ def load_meta(path: Path) -> dict[str, Any]:
         raise DamagedError(f"{META} is cut or overwritten ({type(error).__name__})") from error
     if found != expected:
         raise DamagedError(f"{META} is not what was written (sha256 differs)")
-    check_object(str(path / META), meta, **KINDS)
+    check_object(
+        str(path / META), meta, update=int, steps=int, wall_s=float, digest=str, metrics_bytes=int,
+        metrics_sha256=str, leaves=dict, files=dict,
+    )  # fmt: skip
     for leaf in meta["leaves"].values():
         check_object(f"{path / META}: leaves", leaf, dtype=str, shape=list, sha256=str)
     return meta

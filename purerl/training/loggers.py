@@ -7,8 +7,7 @@ import contextlib
 import math
 import queue
 import threading
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,8 @@ from purerl.machine.output import Say, say
 from purerl.runs.folder import Folder, read
 from purerl.runs.metrics_file import Record, read_metrics
 
+MOST = 256  # records that may wait
+
 
 class BackgroundLogger:
     """A sink (`log(record)`, `close()`) in a thread of its own.
@@ -26,7 +27,7 @@ class BackgroundLogger:
     It is dropped, with one message, when it raises or lags.
     """
 
-    def __init__(self, name: str, open_sink: Callable[[], Any], say: Say, size: int = 256) -> None:
+    def __init__(self, name: str, open_sink: Callable[[], Any], say: Say, size: int = MOST) -> None:
         """Opens the sink in the thread; `size` records may wait before it counts as too slow."""
         self.name, self.say = name, say
         self.queue: queue.Queue[Record | None] = queue.Queue(size)
@@ -141,12 +142,8 @@ def open_loggers(options: RunOptions, folder: Folder, say: Say) -> list[Backgrou
     if mode != "off":
         found["W&B"] = lambda: WandbSink(folder, mode, project)
     owed = read_metrics(folder.metrics) if found else []
-    return [BackgroundLogger(k, partial(_send, sink, owed), say) for k, sink in found.items()]
-
-
-def _send(open_sink: Callable[[], Any], owed: Sequence[Record]) -> Any:
-    """Returns a sink that has got the records `owed`."""
-    sink = open_sink()
-    for record in owed:
-        sink.log(record)
-    return sink
+    opened = [BackgroundLogger(k, sink, say, MOST + len(owed)) for k, sink in found.items()]
+    for logger in opened:
+        for record in owed:
+            logger.log(record)
+    return opened

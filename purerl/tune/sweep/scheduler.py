@@ -66,14 +66,13 @@ def _has_ended(folder: Path) -> bool:
 
 def is_locked(job: Job) -> bool:
     """Tells whether a process trains the job."""
-    for folder in job.folders:
-        if folder.is_dir():
-            try:
-                lock.FolderLock(folder, patience=0.0).close()
-            except UserError:
-                return True
-            except OSError:  # the run itself will say what is wrong with it
-                return False
+    for folder in filter(Path.is_dir, job.folders):
+        try:
+            lock.FolderLock(folder, patience=0.0).close()
+        except UserError:
+            return True
+        except OSError:  # the run itself will say what is wrong with it
+            return False
     return False
 
 
