@@ -26,10 +26,13 @@ class CompareOptions:
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Runs, folders of runs (runs/ant_run), or patterns ('runs/ant_run/wide*'). Runs that differ in
-    their seed alone are a group; the first one's is what the others are compared with."""
+    """Runs, folders of runs (runs/ant_run), or patterns ('runs/ant_run/wide*'). The group of the
+    first one is what the others are compared with."""
     metric: str = "eval/episode_return"
     """What to compare; a run's score is its last value."""
+    group_by: tuple[str, ...] = ()
+    """Settings that make a group, such as ppo.learning_rate or experiment; by default all in which
+    the runs differ, but the seed."""
     out: Path | None = None
     """Folder for compare.json, groups.csv, curves.csv and curves.png."""
 
@@ -38,7 +41,7 @@ def command(options: CompareOptions) -> int:
     """Compares, prints and writes what was asked for; returns the exit code."""
     from purerl.report import comparison
 
-    result, curves = comparison.compare(options.runs, options.metric)
+    result, curves = comparison.compare(options.runs, options.metric, options.group_by)
     output.show(*comparison.describe(result))
     if options.out is not None:
         comparison.write(options.out, result, curves)

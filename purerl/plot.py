@@ -37,7 +37,7 @@ def command(options: PlotOptions) -> None:
     if options.out is not None and options.out.suffix not in (".png", ".pdf", ".svg"):
         raise UserError(f"out is {options.out}; it must end in .png, .pdf or .svg.")
     runs = read_runs(options.runs, "plot")
-    groups = make_groups(runs)
+    groups = make_groups(runs, ())
     check_plotted(runs, options.metric)
     curves = [every_curve(group, options.metric) for group in groups]
     columns, rows = shutil.get_terminal_size((100, 30))

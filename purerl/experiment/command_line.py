@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import enum
 import io
 import re
 import shlex
@@ -161,7 +162,8 @@ def _words(name: str, value: Any) -> list[str]:
     if isinstance(value, Mapping):
         value = [part for pair in value.items() for part in pair]
     parts = value if isinstance(value, list | tuple) else [value]
-    return [f"--{name.replace('_', '-')}", *map(str, parts)]
+    texts = [part.name if isinstance(part, enum.Enum) else str(part) for part in parts]
+    return [f"--{name.replace('_', '-')}", *texts]
 
 
 def parse(

@@ -1,6 +1,7 @@
 """Does a value fit a setting, a name one that there is? What a folder says may be a stranger's."""
 
 import dataclasses
+import enum
 import inspect
 import re
 import types
@@ -31,10 +32,11 @@ def fits(hint: Any, value: Any, exact: bool = False) -> bool:
     (True, False, False)
     """
     origin, inner = get_origin(hint) or hint, get_args(hint)
+    value = value.name if isinstance(value, enum.Enum) else value  # so JSON holds it
     if origin in (Union, types.UnionType):
         return any(fits(one, value, exact) for one in inner)
     if origin is Literal:
-        return value in inner
+        return value in [getattr(one, "name", one) for one in inner]
     if origin in (tuple, list):
         every = origin is list or inner[1:] == (...,)
         wanted = inner[:1] * len(value) if every and isinstance(value, tuple | list) else inner
@@ -47,6 +49,8 @@ def fits(hint: Any, value: Any, exact: bool = False) -> bool:
         return value is None
     if not isinstance(origin, type):
         return True
+    if issubclass(origin, enum.Enum):
+        return isinstance(value, str) and value in origin.__members__
     if issubclass(origin, int | float):  # a whole number may stand for a float, true for 1
         return _is_number(origin, value) if exact else isinstance(value, int | float)
     return not issubclass(origin, str | Path) or isinstance(value, str | origin)

@@ -1,6 +1,7 @@
 """An experiment's settings as JSON values, and back."""
 
 import dataclasses
+import enum
 import inspect
 import reprlib
 from pathlib import Path
@@ -29,6 +30,8 @@ def to_json(value: Any, path: str = "") -> Any:
     """Turns settings into JSON values; UserError names a field that JSON cannot hold."""
     if has_settings(value):
         value = settings_of(value)
+    if isinstance(value, enum.Enum):
+        return value.name
     if isinstance(value, dict) and all(isinstance(key, str) for key in value):
         return {key: to_json(v, _join(path, key)) for key, v in value.items()}
     if isinstance(value, tuple | list):
@@ -65,6 +68,8 @@ def from_json(template: Any, values: Any, path: str = "") -> Any:
             raise
         except Exception as error:  # a rule of the dataclass, or of its author
             raise UserError(f"config.json: {path or 'experiment'}: {one_line(error)}") from error
+    if isinstance(template, enum.Enum):
+        return type(template)[values]
     if isinstance(template, Path):
         return Path(values)
     if isinstance(values, dict):

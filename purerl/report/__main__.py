@@ -23,6 +23,9 @@ class ReportOptions:
     """Runs, folders of runs (runs/ant_run), or patterns ('runs/ant_run/wide*')."""
     out: Path = Path("report.html")
     """The file to write."""
+    group_by: tuple[str, ...] = ()
+    """Settings that make a group, such as ppo.learning_rate; by default all in which the runs
+    differ, but the seed."""
 
 
 def command(options: ReportOptions) -> None:
@@ -33,7 +36,7 @@ def command(options: ReportOptions) -> None:
     if options.out.is_dir():
         raise UserError(f"{options.out} is a folder: give a file, as --out report.html.")
     runs = read_runs(options.runs, "report")
-    page = make_page(runs).encode()
+    page = make_page(runs, options.group_by).encode()
     files.write_answer(options.out, page)
     number = f"{len(runs)} run{'s' * (len(runs) > 1)}"
     output.show(f"{options.out} ({number}, {len(page):,} bytes): open it in a browser")

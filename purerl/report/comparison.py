@@ -33,34 +33,37 @@ CURVES = f"Interquartile mean (mean below {LEAST_IQM} seeds), 95% intervals from
 LONGEST_LABEL = 60  # beside the other columns it fits a wide terminal
 
 
-def compare(places: Sequence[Path], metric: str) -> tuple[dict[str, Any], list[Curve]]:
+def compare(
+    places: Sequence[Path], metric: str, group_by: Sequence[str]
+) -> tuple[dict[str, Any], list[Curve]]:
     """Compares runs bit by bit where they should be equal, and by statistics over seeds.
 
     Args:
       places: runs, folders of runs, or patterns.
       metric: what is compared.
+      group_by: settings that make a group; none: all in which the runs differ, but the seed.
 
     Returns:
       The whole comparison as JSON values, and the groups' learning curves.
 
     Raises:
-      UserError: a place means no run, or there is no such metric.
+      UserError: a place means no run, or there is no such metric or setting.
     """
-    result, curves = compare_records(run_reader.read_runs(places, "compare"), metric)
+    result, curves = compare_records(run_reader.read_runs(places, "compare"), metric, group_by)
     if result["unscored"] and not result["pairs"]:  # else the bits can be compared all the same
         raise UserError(result["unscored"])
     return result, curves
 
 
 def compare_records(
-    runs: Sequence[run_reader.RunRecord], metric: str
+    runs: Sequence[run_reader.RunRecord], metric: str, group_by: Sequence[str]
 ) -> tuple[dict[str, Any], list[Curve]]:
     """Compares runs that were read, as `compare`; "unscored" says why there are no scores."""
     first: dict[str, run_reader.RunRecord] = {}
     any_code = [run._replace(settings=run.settings | {"code": ""}).identity for run in runs]
     repeats = [(first.setdefault(name, run), run) for name, run in zip(any_code, runs, strict=True)]
     pairs = [bit_diff.compare_bits(a, b) for a, b in repeats if a is not b]
-    groups = seed_statistics.make_groups(runs)
+    groups = seed_statistics.make_groups(runs, group_by)
     unscored = ""
     try:
         seed_statistics.check_scored(runs, groups, metric)

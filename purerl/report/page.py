@@ -21,15 +21,20 @@ HERE = Path(__file__).parent
 FOLDERS = re.compile(r"""(data:[^"]*)|(?<![\w./:<])/(?:[^/<>"\s]+/)+""")  # not in pictures
 
 
-def make_page(runs: Sequence[run_reader.RunRecord]) -> str:
+def make_page(runs: Sequence[run_reader.RunRecord], group_by: Sequence[str] = ()) -> str:
     """Returns the whole page as HTML; the same runs give the same page.
 
-    Runs of one configuration and seed are drawn once.
+    Args:
+      runs: what it is about; runs of one configuration and seed are drawn once.
+      group_by: settings that make a group, as in `compare`.
+
+    Raises:
+      UserError: there is no such setting.
     """
     folders = [run.path for run in runs]
     runs = [run._replace(path=Path(*run.path.parts[-2:])) for run in runs]
-    groups = make_groups(runs)
-    result, _ = comparison.compare_records(runs, page_series.RETURN)
+    groups = make_groups(runs, group_by)
+    result, _ = comparison.compare_records(runs, page_series.RETURN, group_by)
     sections = page_series.panels(groups)
     experiments = list(dict.fromkeys(run.settings["experiment"] for run in runs))
     title = f"{', '.join(experiments)}: {len(runs)} run{'s' * (len(runs) > 1)}"

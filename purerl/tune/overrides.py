@@ -1,6 +1,7 @@
 """Settings as the words of a command line that make them; pure."""
 
 import dataclasses
+import enum
 import shlex
 from typing import Any
 
@@ -26,7 +27,8 @@ def option_words(name: str, default: Any, value: Any) -> list[str]:
         path, dot, last = option.rpartition(".")
         return [f"--{path}{dot}{last if value else f'no-{last}'}"]
     parts = value if isinstance(value, list | tuple) else [value]
-    return [f"--{option}", *map(_text, parts)]
+    texts = [part.name if isinstance(part, enum.Enum) else _text(part) for part in parts]
+    return [f"--{option}", *texts]
 
 
 def _text(value: Any) -> str:

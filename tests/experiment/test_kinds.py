@@ -1,14 +1,16 @@
 """Settings of the wrong kind, which Python itself does not notice, are refused by name."""
 
 import dataclasses
+import enum
 from dataclasses import dataclass
 
 import pytest
 
 from purerl.core.errors import UserError
-from purerl.experiment import objects
-from purerl.experiment.kinds import wrong_value
+from purerl.experiment import objects, settings_json
+from purerl.experiment.kinds import fits, wrong_value
 from purerl.experiments import cartpole_swingup
+from purerl.tune import overrides
 
 EXPERIMENT = cartpole_swingup.experiment
 
@@ -51,6 +53,24 @@ def test_a_value_of_the_wrong_kind_is_told_and_never_trained(experiment, told):
 def test_a_text_for_a_number_is_told_by_its_setting():
     with pytest.raises(ValueError, match="learning_rate is '3e-4'; it must be a number above 0"):
         changed("ppo", learning_rate="3e-4")
+
+
+class Ground(enum.Enum):
+    SAND = 1
+    ICE = 2
+
+
+@dataclass(frozen=True)
+class OnGround:
+    ground: Ground = Ground.SAND
+
+
+def test_an_enumeration_is_a_setting_by_its_names():
+    words = settings_json.to_json(OnGround(Ground.ICE))
+    assert words == {"ground": "ICE"}
+    assert settings_json.from_json(OnGround(), words) == OnGround(Ground.ICE)
+    assert fits(Ground, "ICE") and not fits(Ground, "MUD") and not fits(Ground, 2)
+    assert overrides.option_words("env.ground", Ground.SAND, Ground.ICE) == ["--env.ground", "ICE"]
 
 
 @dataclass(frozen=True)

@@ -260,13 +260,26 @@ def test_an_older_run_with_a_setting_that_is_gone_is_unfinished_too(tmp_path):
     assert run_reader.read(folder).status == "unfinished"
 
 
-def test_all_settings_that_differ_make_groups(tmp_path):
+def test_groups_can_be_chosen_and_what_is_left_aside_makes_strata(tmp_path):
     runs = tmp_path / "runs"
-    for name, experiment, rate in [("a", "walk", 1e-3), ("b", "hop", 1e-3), ("c", "hop", 3e-3)]:
-        make_seeds(runs, name, [1.0, 2.0], rate=rate, experiment=experiment)
-    labels = [group["label"] for group in found(tmp_path, runs)["groups"]]
-    rates = [("walk", 0.001), ("hop", 0.001), ("hop", 0.003)]
-    assert labels == [f"{experiment} ppo.learning_rate={rate}" for experiment, rate in rates]
+    for name, experiment, rate, finals in [
+        ("a", "walk", 1e-3, [1.0, 2.0]),
+        ("b", "hop", 1e-3, [100.0, 200.0]),
+        ("c", "walk", 3e-3, [3.0, 4.0]),
+        ("d", "hop", 3e-3, [20.0, 150.0]),
+    ]:
+        make_seeds(runs, name, finals, rate=rate, experiment=experiment)
+    assert len(found(tmp_path, runs)["groups"]) == 4
+    result = found(tmp_path, runs, "--group-by", "ppo.learning-rate")
+    labels = [group["label"] for group in result["groups"]]
+    assert labels == ["ppo.learning_rate=0.001", "ppo.learning_rate=0.003"]
+    # Better in all pairs of walk and in 1 of 4 of hop; of all 16 pairs it would be 9.
+    assert result["versus_first"][0]["improvement"] == 0.625
+    # Each task with itself: 2, 2, -80, -50.
+    assert result["versus_first"][0]["same_seeds"] == 4
+    assert result["versus_first"][0]["paired_difference"] == -24.0
+    labels = [g["label"] for g in found(tmp_path, runs, "--group-by", "experiment")["groups"]]
+    assert labels == ["walk", "hop"]
 
 
 # --- the same run twice ---
@@ -407,6 +420,7 @@ def test_a_mistake_is_one_line(tmp_path, capsys):
         ([str(tmp_path / "nowhere")], "no run"),
         ([str(tmp_path / "none*")], "no run"),
         ([runs, "--metric", "eval/episode_retrun"], "Did you mean 'eval/episode_return'?"),
+        ([runs, "--group-by", "ppo.lerning_rate"], "Did you mean 'ppo.learning_rate'?"),
         ([runs, "--metrik", "x"], "--metric"),
     ]:
         assert compare.main(words) == USAGE, words

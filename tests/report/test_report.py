@@ -304,6 +304,7 @@ def test_a_mistake_is_one_line(tmp_path, capsys):
     for words, part in [
         ([], "Give the runs"),
         ([str(tmp_path / "nowhere")], "no run"),
+        ([runs, "--group-by", "ppo.lerning_rate"], "Did you mean 'ppo.learning_rate'?"),
         ([runs, "--out", str(tmp_path)], "is a folder"),
         ([runs, "--out", str(tmp_path / "no" / "r.html")], "cannot be written"),
     ]:

@@ -59,7 +59,7 @@ def group_of(base: Base, point: Point) -> Group:
     for folder in job(base, point).folders:
         with contextlib.suppress(UserError):  # not begun
             runs.append(run_reader.read(folder))
-    return Group(point.name, runs)
+    return Group(point.name, runs, {"": runs})
 
 
 def _rank(row: Row) -> tuple[Any, ...]:
