@@ -63,8 +63,9 @@ def bounds(value: int | float) -> tuple[float, float, float]:
 
 
 def _step(width: float) -> float:
-    """Returns a step of one digit, of which 100 to 225 fit into `width`."""
-    return float(f"{width / 150:.0e}")
+    """Returns the greatest of 1, 2, 5 times a power of ten of which 100 fit into `width`."""
+    digits, power = f"{width / 100:e}".split("e")
+    return float(f"{max(x for x in (1, 2, 5) if x <= float(digits))}e{power}")
 
 
 def label(place: Place) -> str:
@@ -73,5 +74,4 @@ def label(place: Place) -> str:
     >>> label(("randomization", "friction", 1))
     'randomization.friction[1]'
     """
-    words = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place)
-    return words.removeprefix(".")
+    return "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in place).removeprefix(".")
