@@ -41,7 +41,7 @@ def test_a_rule_sees_all_numbers_that_change_together():
         replaced(options, {("friction", 0): 1.5})
 
 
-@pytest.mark.parametrize("value", [5.0, 0.05, 1e-5, 3.7e4, -2.0, 0.0, 5, 1, 0, -3, 4096])
+@pytest.mark.parametrize("value", [5.0, 1.0, 0.05, 1e-5, 3.7e4, -2.0, 0.0, 5, 1, 0, -3, 4096])
 def test_a_slider_reaches_from_nought_to_four_times_the_number(value):
     least, greatest, step = bounds(value)
     assert least <= 0 <= greatest and least <= value <= greatest
@@ -49,6 +49,7 @@ def test_a_slider_reaches_from_nought_to_four_times_the_number(value):
     assert isinstance(step, type(value)) and 0 < step <= greatest - least
     if isinstance(value, float):
         assert 100 <= (greatest - least) / step <= 501
+        assert max(-least, greatest) == pytest.approx(4 * abs(value) or 1.0)
 
 
 # --- words ---
