@@ -1,0 +1,170 @@
+"""Which values stand in memory, and which are computed anew wherever they are read.
+
+A map that is read once becomes a part of what reads it. One that is read more often is kept, unless
+it is so cheap that reading it costs as much as computing it. Terms of a sum along lanes are computed
+in the sum's own loop: there they would only take memory and a statement more.
+"""
+
+import collections
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from purerl.exact.kernel.lanes import LANES
+from purerl.exact.kernel.operations import OPERATIONS
+from purerl.exact.kernel.values import (
+    Block,
+    Choice,
+    Const,
+    Fold,
+    Held,
+    Linear,
+    Loop,
+    Map,
+    Step,
+    Value,
+    View,
+)
+
+MOST_REPEATED = 16  # additions that may be made again, in all, because numbers are read repeatedly
+CHEAP, FEW_USES, LARGE = 1, 4, 4096
+
+
+def blocks_of(step: Step) -> list[Block]:
+    """Returns the blocks inside a step, in the order in which they run."""
+    if isinstance(step, Loop):
+        return [block for block in (step.test, step.inner) if block]
+    return step.branches if isinstance(step, Choice) else []
+
+
+def copied_by(step: Step) -> list[Value]:
+    """Returns which of the values that a step reads are copied to where it writes."""
+    if isinstance(step, Loop):
+        return step.reads
+    return step.reads[-1:] if isinstance(step, Linear) else []
+
+
+def read_inside(step: Step) -> Iterator[tuple[Value, Block]]:
+    """Yields the values that a step reads at the end of a block inside of it."""
+    if isinstance(step, Loop):
+        yield from ((value, step.inner) for value in step.results)
+        if step.test and step.going:
+            yield step.going, step.test
+    if isinstance(step, Choice):
+        for block, results in zip(step.branches, step.results, strict=True):
+            yield from ((value, block) for value in results)
+
+
+def in_order(block: Block) -> Iterator[Any]:
+    """Yields what a block computes at any depth, a step after what is inside of it."""
+    for item in block.items:
+        if isinstance(item, Step):
+            for inner in blocks_of(item):
+                yield from in_order(inner)
+        yield item
+
+
+class Uses:
+    """How often values are read, where, and in what way."""
+
+    def __init__(self) -> None:
+        """Begins with none."""
+        self.number: dict[Value, int] = collections.Counter()
+        self.blocks: dict[Value, set[Block]] = collections.defaultdict(set)
+        self.only_by_lanes: dict[Value, bool] = {}
+        self.as_they_stand: set[Value] = set()  # read by a step, or by a view of several values
+
+    def add(self, value: Value, block: Block, by_lanes: bool, stands: bool = False) -> None:
+        """Notes that something in a block reads a value; a view passes it on."""
+        several = isinstance(value, View) and len(value.sources) > 1
+        if stands:
+            self.as_they_stand.add(value)
+        if isinstance(value, View):
+            for source in value.sources:
+                self.add(source, block, by_lanes and not several, stands or several)
+            return
+        self.number[value] += 1
+        self.blocks[value].add(block)
+        self.only_by_lanes[value] = by_lanes and self.only_by_lanes.get(value, True)
+
+
+def kept(top: Block, outputs: list[Value]) -> set[Value]:
+    """Returns the maps and folds that stand in memory."""
+    uses = Uses()
+    keep: set[Value] = set()
+    for value in outputs:
+        uses.add(value, top, False, stands=True)
+    items = list(in_order(top))
+    for item in reversed(items):
+        if isinstance(item, Step):
+            _add_step(uses, item)
+        elif uses.number[item] and _is_kept(item, uses):
+            keep.add(item)
+        if isinstance(item, Map | Fold) and uses.number[item]:
+            _add_args(uses, item, item in keep)
+    costs: dict[Value, int] = {}
+    for item in items:
+        if isinstance(item, Map) and uses.number[item]:
+            _keep_what_repeats(item, keep, costs, uses)
+            costs[item] = OPERATIONS[item.op].cost + sum(_cost(x, keep, costs) for x in item.args)
+            if item in keep and costs[item] <= CHEAP and _may_be_repeated(item, uses):
+                keep.remove(item)
+        elif isinstance(item, Fold) and uses.number[item]:
+            _keep_what_repeats(item, keep, costs, uses)
+    return keep
+
+
+def _add_step(uses: Uses, step: Step) -> None:
+    """Notes what a step reads; what is copied to where it writes may be computed on the way."""
+    for value in step.reads:
+        copied = value in copied_by(step)
+        uses.add(value, step.block, False, stands=not copied)
+    for value, block in read_inside(step):
+        uses.add(value, block, False, stands=True)
+
+
+def _add_args(uses: Uses, item: Map | Fold, is_kept: bool) -> None:
+    by_lanes = _by_lanes(item) or (not is_kept and uses.only_by_lanes[item])
+    for arg in item.args if isinstance(item, Map) else [item.arg]:
+        uses.add(arg, item.block, by_lanes)
+    if isinstance(item, Map) and item.op == "lookup":
+        uses.add(item.param, item.block, False, stands=True)
+
+
+def _by_lanes(item: Map | Fold) -> bool:
+    return isinstance(item, Fold) and item.lanes
+
+
+def _is_kept(item: Map | Fold, uses: Uses) -> bool:
+    elsewhere = uses.blocks[item] != {item.block}
+    if isinstance(item, Fold) or elsewhere or item in uses.as_they_stand:
+        return True
+    terms = uses.only_by_lanes[item] and item.size >= LANES
+    return uses.number[item] > 1 and not terms
+
+
+def _keep_what_repeats(
+    item: Map | Fold, keep: set[Value], costs: dict[Value, int], uses: Uses
+) -> None:
+    """Keeps arguments of which the same numbers would be computed too often."""
+    for arg in item.args if isinstance(item, Map) else [item.arg]:
+        if isinstance(arg, View) and len(arg.sources) == 1 and arg.size:
+            (source,) = arg.sources
+            often = int(np.bincount(arg.index).max())
+            terms = uses.only_by_lanes.get(source, False)
+            costly = often > 1 and often * _cost(source, keep, costs) > MOST_REPEATED
+            if isinstance(source, Map) and costly and not terms:
+                keep.add(source)
+
+
+def _cost(value: Value, keep: set[Value], costs: dict[Value, int]) -> int:
+    """Returns what computing one number anew costs."""
+    if isinstance(value, View):
+        return max(_cost(source, keep, costs) for source in value.sources)
+    return 0 if value in keep or isinstance(value, Const | Held) else costs.get(value, 0)
+
+
+def _may_be_repeated(item: Map, uses: Uses) -> bool:
+    small = uses.number[item] <= FEW_USES and item.size <= LARGE
+    return small and uses.blocks[item] == {item.block} and item not in uses.as_they_stand

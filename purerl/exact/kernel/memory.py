@@ -1,0 +1,137 @@
+"""Where each value stands in an environment's memory, which is as small as it can easily be made.
+
+Memory of values that are never needed at once is shared. Shared memory of a GPU is what decides how
+many environments a multiprocessor steps side by side.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from purerl.exact.kernel.schedule import SLOTS, Plan, Scheduler, Statement, StepStatement
+from purerl.exact.kernel.values import Held, Value, home
+
+TRIES = 24
+
+
+class Memory(NamedTuple):
+    """The place of each value, in numbers of 4 bytes."""
+
+    address: dict[Value, int]  # by its home
+    size: int
+    live: int  # numbers that are needed at once, at most: no memory can be smaller
+
+
+class _Span(NamedTuple):
+    """Values side by side, and when they are needed."""
+
+    values: list[Value]
+    first: int
+    last: int
+
+    @property
+    def size(self) -> int:
+        return sum(x.size for x in self.values)
+
+
+class _Clock:
+    """Walks through a plan as it runs, and notes when each value is written first and read last.
+
+    A loop needs what it reads of outside until it ends.
+    """
+
+    def __init__(self) -> None:
+        self.now = 0
+        self.first: dict[Value, int] = {}
+        self.last: dict[Value, int] = {}
+        self.groups: list[list[Value]] = []
+
+    def read(self, values: set[Value]) -> None:
+        self.last |= dict.fromkeys(values, self.now)
+
+    def write(self, values: Sequence[Value]) -> None:
+        values = [home(x) for x in values]
+        self.groups.append(values)
+        for value in values:
+            self.first.setdefault(value, self.now)
+            self.last[value] = self.now
+
+    def run(self, plan: Plan) -> None:
+        for level in plan.levels:
+            self.now += 1
+            for statement in level:
+                if isinstance(statement, Statement):
+                    self.read(statement.reads())
+                    self.write(statement.writes)
+            for statement in level:
+                if isinstance(statement, StepStatement):
+                    self._step(statement)
+        self.now += 1
+        for target, code in plan.copies:
+            self.read(code.reads())
+        if plan.test:
+            self.read(plan.test.reads())
+
+    def _step(self, statement: StepStatement) -> None:
+        self.read(statement.reads())
+        self.write(statement.writes)
+        for plan in statement.plans:
+            self.now += 1
+            self.run(plan)
+        self.now += 1
+        for plan in statement.plans:
+            self.read(plan.outside)
+        self.read(set(statement.writes))
+
+
+def placed(scheduler: Scheduler, inputs: Sequence[Held]) -> Memory:
+    """Returns a place for every value but the outputs, which are copied to the caller's arrays."""
+    clock = _Clock()
+    for value in inputs:
+        clock.write([value])
+    clock.run(scheduler.plan)
+    spans = [_Span(g, min(clock.first[x] for x in g), max(clock.last[x] for x in g))
+             for g in clock.groups]  # fmt: skip
+    tries = [_first_fit(spans, order, len(scheduler.slots)) for order in _orders(spans)]
+    size, places = min(tries, key=lambda found: found[0])
+    address = {SLOTS: 0}
+    for span, place in zip(spans, places, strict=True):
+        for value in span.values:
+            address[value] = place
+            place += value.size
+    times = sorted({span.first for span in spans})
+    live = max(sum(s.size for s in spans if s.first <= t <= s.last) for t in times)
+    return Memory(address, max(size, 1), live + len(scheduler.slots))
+
+
+def _orders(spans: Sequence[_Span]) -> Iterator[np.ndarray]:
+    """Yields orders in which to place: large and long-lived first, each a bit otherwise."""
+    sizes = np.array([span.size for span in spans], float)
+    times = np.array([min(span.last, 10**5) - span.first + 1 for span in spans], float)
+    rng = np.random.default_rng(0)
+    for number in range(TRIES):
+        noise = np.exp(0.3 * rng.normal(size=len(spans)) * (number > 2))
+        yield np.argsort(-sizes * times ** (0.0, 0.5, 1.0)[number % 3] * noise, kind="stable")
+
+
+def _first_fit(
+    spans: Sequence[_Span], order: np.ndarray, start: int
+) -> tuple[int, list[int]]:
+    """Returns the memory's size and a place for each span: the first free one, in this order."""
+    places = [0] * len(spans)
+    done: list[tuple[int, int, int, int]] = []  # by place: (from, to, first, last)
+    for number in order:
+        span = spans[number]
+        at = start
+        for begin, end, first, last in done:
+            if last < span.first or first > span.last:
+                continue
+            if at + span.size <= begin:
+                break
+            at = max(at, end)
+        places[number] = at
+        done.append((at, at + span.size, span.first, span.last))
+        done.sort()
+    return max([start, *(end for _, end, _, _ in done)]), places
+

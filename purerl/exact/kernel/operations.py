@@ -1,0 +1,126 @@
+"""The operations on single numbers: as C, as numpy, and what they cost.
+
+One table, so that what is known before a kernel runs is computed as the kernel would.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from purerl.exact.kernel.values import DTYPES
+
+
+class Operation(NamedTuple):
+    """What one operation is."""
+
+    text: str | Callable[[str, Any], str]  # "({} + {})"; or made from (kind, parameter)
+    compute: Callable[..., Any] | None = None  # by numpy; None: not before the kernel runs
+    cost: int = 1  # in additions, roughly
+
+
+def _compare(sign: str, compute: Callable) -> Operation:
+    return Operation(f"({{}} {sign} {{}})", compute)
+
+
+def _call(name: str, compute: Callable | None, cost: int = 30) -> Operation:
+    return Operation(f"{name}({{}})", compute, cost)
+
+
+def _power(kind: str, exponent: int) -> str:
+    """By multiplication: a square is the most frequent one."""
+    times = "*".join(["{0}"] * abs(exponent)) or "1"
+    return f"({times})" if exponent >= 0 else f"(1.0f/({times}))"
+
+
+def _convert(kind: str, param: Any) -> str:
+    return {"f": "((float)({}))", "i": "((int)({}))", "b": "({} != 0)"}[kind]
+
+
+def _remainder(x: Any, y: Any) -> Any:
+    return np.fmod(x, y) if x.dtype.kind == "f" else np.fmod(x, np.where(y == 0, 1, y))
+
+
+OPERATIONS = {
+    "add": Operation("({} + {})", np.add),
+    "sub": Operation("({} - {})", np.subtract),
+    "mul": Operation("({} * {})", np.multiply),
+    "div": Operation("({} / {})", None, 8),
+    "neg": Operation("(-{})", np.negative),
+    "abs": Operation(lambda kind, _: "fabsf({})" if kind == "f" else "abs({})", np.abs),
+    "max": Operation("most({}, {})", np.maximum),
+    "min": Operation("least({}, {})", np.minimum),
+    "sign": Operation("sign_of({})", np.sign),
+    "floor": _call("floorf", np.floor, 1),
+    "ceil": _call("ceilf", np.ceil, 1),
+    "round": _call("rintf", np.round, 1),
+    "square": Operation("({0}*{0})", np.square),
+    "integer_pow": Operation(_power),
+    "sqrt": _call("sqrtf", np.sqrt, 8),
+    "rsqrt": Operation("(1.0f/sqrtf({}))", None, 16),
+    "cbrt": _call("cbrtf", np.cbrt),
+    "sin": _call("sinf", np.sin),
+    "cos": _call("cosf", np.cos),
+    "tan": _call("tanf", np.tan),
+    "asin": _call("asinf", np.arcsin),
+    "acos": _call("acosf", np.arccos),
+    "atan": _call("atanf", np.arctan),
+    "sinh": _call("sinhf", np.sinh),
+    "cosh": _call("coshf", np.cosh),
+    "tanh": _call("tanhf", np.tanh),
+    "exp": _call("expf", np.exp, 10),
+    "exp2": _call("exp2f", np.exp2, 10),
+    "expm1": _call("expm1f", np.expm1),
+    "log": _call("logf", np.log, 12),
+    "log1p": _call("log1pf", np.log1p),
+    "logistic": Operation("(1.0f/(1.0f + expf(-{})))", None, 20),
+    "atan2": Operation("atan2f({}, {})", np.arctan2, 40),
+    "pow": Operation("powf({}, {})", None, 40),
+    "rem": Operation(
+        lambda kind, _: "fmodf({}, {})" if kind == "f" else "rest_of({}, {})", _remainder, 10
+    ),
+    "lt": _compare("<", np.less),
+    "le": _compare("<=", np.less_equal),
+    "gt": _compare(">", np.greater),
+    "ge": _compare(">=", np.greater_equal),
+    "eq": _compare("==", np.equal),
+    "ne": _compare("!=", np.not_equal),
+    "and": _compare("&", np.bitwise_and),
+    "or": _compare("|", np.bitwise_or),
+    "xor": _compare("^", np.bitwise_xor),
+    "not": Operation(lambda kind, _: "(!{})" if kind == "b" else "(~{})", np.invert),
+    "is_finite": _call("is_finite", np.isfinite, 1),
+    "select_n": Operation("({0} ? {2} : {1})", lambda which, no, yes: np.where(which, yes, no)),
+    "convert_element_type": Operation(_convert),
+    "copy": Operation("{}"),
+    "lookup": Operation("{}"),  # of a place in the memory of another value: written by `text.py`
+}
+_NEUTRAL = {"add": "0", "mul": "1", "or": "0"}
+
+
+def neutral(op: str, kind: str) -> str:
+    """Returns C for what a fold starts from."""
+    if op in ("max", "min"):
+        least, most = ("-INFINITY", "INFINITY") if kind == "f" else ("INT_MIN", "INT_MAX")
+        return least if op == "max" else most
+    return _NEUTRAL.get(op, "1" if kind == "b" else "-1")
+
+
+def text_of(op: str, kind: str, param: Any, *args: str) -> str:
+    """Returns C for an operation whose result is of a kind."""
+    text = OPERATIONS[op].text
+    return (text if isinstance(text, str) else text(kind, param)).format(*args)
+
+
+def computed(op: str, kind: str, param: Any, *arrays: np.ndarray) -> np.ndarray | None:
+    """Returns the result of an operation on arrays; None if only the kernel computes it."""
+    dtype = DTYPES[kind]
+    if op == "convert_element_type":
+        return (arrays[0] != 0) if kind == "b" else arrays[0].astype(dtype)
+    if op == "integer_pow":
+        return (arrays[0] ** param).astype(dtype)
+    if op == "div":
+        quotient = np.true_divide(*arrays)
+        return (quotient if kind == "f" else np.trunc(quotient)).astype(dtype)
+    compute = OPERATIONS[op].compute
+    return None if compute is None else np.asarray(compute(*arrays), dtype)

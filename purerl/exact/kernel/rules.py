@@ -1,0 +1,405 @@
+"""A rule for each primitive: what its results are in terms of values.
+
+A rule is called with (builder, equation, *inputs) and returns the result, or a list of them. To
+compute one primitive more, write its rule and add it to `RULES`, which stands at the end.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend import core
+
+from purerl.exact import scatters
+from purerl.exact.kernel.builder import Builder
+from purerl.exact.kernel.operations import OPERATIONS
+from purerl.exact.kernel.values import Const, NoRuleError, Value, View, kind_of
+
+FEW = 4  # numbers: one of so few is chosen, one of more is read from memory
+Rule = Callable[..., Any]
+
+
+def _elementwise(build: Builder, eqn: core.JaxprEqn, *args: Value) -> Value:
+    kind = kind_of(eqn.outvars[0].aval.dtype)
+    if eqn.primitive.name == "select_n" and len(args) > 3:
+        return _select_of_many(build, *args)
+    if eqn.primitive.name in ("and", "or", "xor", "not") and kind == "f":
+        raise NoRuleError("bits of real numbers")
+    return build.map(eqn.primitive.name, *args, kind=kind, param=eqn.params.get("y"))
+
+
+def _select_of_many(build: Builder, which: Value, first: Value, *others: Value) -> Value:
+    for number, other in enumerate(others, 1):
+        chosen = build.map("ge", which, build.const(np.int32(number)), kind="b")
+        first = build.map("select_n", chosen, first, other, kind=first.kind)
+    return first
+
+
+def _clamp(build: Builder, eqn: core.JaxprEqn, low: Value, x: Value, high: Value) -> Value:
+    return build.map("min", build.map("max", x, low), high)
+
+
+def _same(build: Builder, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
+    return list(args)
+
+
+# --- other places: views ---
+
+
+def _place(function: Callable[[dict, np.ndarray], np.ndarray]) -> Rule:
+    """Makes a rule of what numpy does with the places of a value."""
+    return lambda build, eqn, x: build.take(x, function(eqn.params, x.places))
+
+
+def _reshape(build: Builder, eqn: core.JaxprEqn, x: Value) -> Value:
+    return build.take(x, x.places.reshape(eqn.outvars[0].aval.shape))
+
+
+def _sliced(p: dict, places: np.ndarray) -> np.ndarray:
+    strides = p["strides"] or (1,) * places.ndim
+    return places[tuple(map(slice, p["start_indices"], p["limit_indices"], strides))]
+
+
+def _broadcast(p: dict, places: np.ndarray) -> np.ndarray:
+    new = [i for i in range(len(p["shape"])) if i not in p["broadcast_dimensions"]]
+    return np.broadcast_to(np.expand_dims(places, new), p["shape"])
+
+
+def _split(build: Builder, eqn: core.JaxprEqn, x: Value) -> list[Value]:
+    ends = np.cumsum(eqn.params["sizes"])[:-1]
+    return [build.take(x, part) for part in np.split(x.places, ends, eqn.params["axis"])]
+
+
+def _pad(build: Builder, eqn: core.JaxprEqn, x: Value, filler: Value) -> Value:
+    places = x.places
+    for axis, (low, high, between) in enumerate(eqn.params["padding_config"]):
+        if between:
+            raise NoRuleError("padding between numbers")
+        kept = range(max(0, -low), places.shape[axis] - max(0, -high))
+        places = np.take(places, kept, axis)
+        width = [(0, 0)] * places.ndim
+        width[axis] = max(0, low), max(0, high)
+        places = np.pad(places, width, constant_values=-1)
+    return build.view([x, filler], (places < 0).astype(int), np.maximum(places, 0))
+
+
+# --- places that may be known only while running ---
+
+
+def _lookup(build: Builder, table: Value, index: Value) -> Value:
+    """Returns the numbers of a table at places, which have to be within it."""
+    if isinstance(index, Const):
+        return build.take(table, index.array)
+    if table.size > FEW:
+        return build.map("lookup", index, kind=table.kind, param=build.standing(table))
+    rows = [build.spread(build.take(table, np.array(i)), index.shape) for i in range(table.size)]
+    return _select_of_many(build, index, *rows)
+
+
+def _number(build: Builder, number: int) -> Value:
+    return build.const(np.int32(number))
+
+
+def _address(build: Builder, starts: Sequence[Value], steps: Sequence[int]) -> Value:
+    """Returns the sum of starts times steps."""
+    found = build.const(np.zeros(starts[0].shape, np.int32)) if starts else _number(build, 0)
+    for start, step in zip(starts, steps, strict=True):
+        found = build.map("add", found, build.map("mul", start, _number(build, step)))
+    return found
+
+
+def _steps(shape: Sequence[int]) -> list[int]:
+    """Returns how far apart neighbours along each axis are."""
+    return [int(np.prod(shape[i + 1 :], dtype=int)) for i in range(len(shape))]
+
+
+def _within(build: Builder, start: Value, room: int) -> Value:
+    return build.map("min", build.map("max", start, _number(build, 0)), _number(build, room))
+
+
+def _gather(build: Builder, eqn: core.JaxprEqn, x: Value, indices: Value) -> Value:
+    """XLA's definition: each index vector says where a window of the operand starts."""
+    p, shape = eqn.params, eqn.outvars[0].aval.shape
+    d, sizes, steps = p["dimension_numbers"], p["slice_sizes"], _steps(x.shape)
+    absent = {*d.collapsed_slice_dims, *d.operand_batching_dims}
+    window = [axis for axis in range(len(x.shape)) if axis not in absent]
+    batch_axes = [axis for axis in range(len(shape)) if axis not in d.offset_dims]
+    place = np.indices(shape)
+    inside = sum((place[o] * steps[w] for o, w in zip(d.offset_dims, window, strict=True)), 0)
+    for dim, axis in zip(d.operand_batching_dims, d.start_indices_batching_dims, strict=True):
+        inside = inside + place[batch_axes[axis]] * steps[dim]
+    row = sum(place[a] * s for a, s in zip(batch_axes, _steps(indices.shape[:-1]), strict=True))
+    width, room = indices.shape[-1], [x.shape[i] - sizes[i] for i in d.start_index_map]
+    at = np.arange(indices.size).reshape(-1, width)
+    asked = [build.take(indices, at[:, k]) for k in range(width)]
+    starts = [_within(build, s, most) for s, most in zip(asked, room, strict=True)]
+    address = _address(build, starts, [steps[i] for i in d.start_index_map])
+    row = np.broadcast_to(row, shape)
+    address = build.map("add", build.take(address, row), build.const(
+        np.broadcast_to(inside, shape).astype(np.int32)))  # fmt: skip
+    found = _lookup(build, x, address)
+    if p["mode"] != jax.lax.GatherScatterMode.FILL_OR_DROP:
+        return found
+    fits = build.const(np.ones(len(at), bool))
+    for one, other in zip(asked, starts, strict=True):
+        fits = build.map("and", fits, build.map("eq", one, other, kind="b"))
+    filler = build.spread(build.const(_filler(p["fill_value"], x.kind)), shape)
+    return build.map("select_n", build.take(fits, row), filler, found, kind=x.kind)
+
+
+def _filler(value: Any, kind: str) -> np.ndarray:
+    """Returns what a gather has where its window does not fit."""
+    if value is None:
+        value = {"f": np.nan, "i": np.iinfo(np.int32).min, "b": True}[kind]
+    return np.asarray(value, {"f": np.float32, "i": np.int32, "b": bool}[kind])
+
+
+def _dynamic_slice(build: Builder, eqn: core.JaxprEqn, x: Value, *asked: Value) -> Value:
+    sizes = eqn.params["slice_sizes"]
+    starts = [_within(build, s, n - m) for s, n, m in zip(asked, x.shape, sizes, strict=True)]
+    window = x.places[tuple(map(slice, sizes))].astype(np.int32)
+    address = build.spread(_address(build, starts, _steps(x.shape)), window.shape)
+    return _lookup(build, x, build.map("add", address, build.const(window)))
+
+
+def _dynamic_update(
+    build: Builder, eqn: core.JaxprEqn, x: Value, new: Value, *asked: Value
+) -> Value:
+    """Each number of the operand is read from the update, if it is within its window."""
+    inside: Value = build.const(np.ones(x.shape, bool))
+    offsets = []
+    for axis, (start, n, m) in enumerate(zip(asked, x.shape, new.shape, strict=True)):
+        place = build.const(np.indices(x.shape)[axis].astype(np.int32))
+        offset = build.map("sub", place, build.spread(_within(build, start, n - m), x.shape))
+        offsets.append(_within(build, offset, m - 1))
+        fits = build.map("eq", offset, offsets[-1], kind="b")
+        inside = build.map("and", inside, fits)
+    put = _lookup(build, new, _address(build, offsets, _steps(new.shape)))
+    return build.map("select_n", inside, x, put, kind=x.kind)
+
+
+def _scatter(build: Builder, eqn: core.JaxprEqn, x: Value, indices: Value, new: Value) -> Value:
+    """Puts, adds or multiplies updates at constant places, each by itself or in their order."""
+    if not isinstance(indices, Const):
+        raise NoRuleError("places that are known only while running")
+    op = eqn.primitive.name.removeprefix("scatter").lstrip("-_")
+    if eqn.params.get("update_jaxpr") is not None and not op:
+        raise NoRuleError("a function of the numbers that stand there")
+    address = scatters.addresses(eqn, indices.array)
+    for turn in _turns(address):
+        put = build.take(new, turn)
+        if op:
+            old = build.take(x, address[turn])
+            put = build.map(op, old, put)
+        which, place = np.zeros(x.size, int), np.arange(x.size)
+        which[address[turn]], place[address[turn]] = 1, np.arange(len(turn))
+        x = build.view([x, put], which, place.reshape(x.shape))
+    return x
+
+
+def _turns(address: np.ndarray) -> list[np.ndarray]:
+    """Splits updates into groups, in their order, so that no two of one meet at an address."""
+    turn_of, groups = {}, []  # type: ignore[var-annotated]
+    for update in np.flatnonzero(address >= 0):
+        turn = turn_of.get(address[update], 0)
+        turn_of[address[update]] = turn + 1
+        groups += [[]] if turn == len(groups) else []
+        groups[turn].append(update)
+    return [np.array(group) for group in groups]
+
+
+# --- sums, and what else makes few numbers of many ---
+
+
+def _rows_of(x: Value, axes: Sequence[int]) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Returns places with `axes` last, and the shape without them."""
+    kept = [axis for axis in range(len(x.shape)) if axis not in axes]
+    return np.transpose(x.places, [*kept, *axes]), tuple(x.shape[axis] for axis in kept)
+
+
+def _reduce(op: str) -> Rule:
+    def rule(build: Builder, eqn: core.JaxprEqn, x: Value) -> Value:
+        places, shape = _rows_of(x, eqn.params["axes"])
+        return build.fold(op, build.take(x, places), shape)
+
+    return rule
+
+
+def _first_of(op: str) -> Rule:
+    """The first of the greatest, or least; a NaN is before any number."""
+
+    def rule(build: Builder, eqn: core.JaxprEqn, x: Value) -> Value:
+        places, shape = _rows_of(x, eqn.params["axes"])
+        rows = build.take(x, places)
+        best = build.fold(op, rows, shape)
+        best = build.take(best, np.broadcast_to(best.places[..., None], places.shape))
+        equal = build.map("eq", rows, best, kind="b")
+        if x.kind == "f":
+            equal = build.map("or", equal, build.map("ne", rows, rows, kind="b"))
+        number = np.broadcast_to(np.arange(places.shape[-1], dtype=np.int32), places.shape)
+        beyond = build.const(np.full(places.shape, places.shape[-1], np.int32))
+        numbers = build.map("select_n", equal, beyond, build.const(number), kind="i")
+        return build.fold("min", numbers, shape)
+
+    return rule
+
+
+def _dot(build: Builder, eqn: core.JaxprEqn, x: Value, y: Value) -> Value:
+    sums, batch = eqn.params["dimension_numbers"]
+    sides = []
+    for value, summed, batched in zip((x, y), sums, batch, strict=True):
+        free = [i for i in range(len(value.shape)) if i not in (*summed, *batched)]
+        places = np.transpose(value.places, [*batched, *free, *summed])
+        parts = [[value.shape[i] for i in axes] for axes in (batched, free, summed)]
+        sides.append(places.reshape([int(np.prod(part, dtype=int)) for part in parts]))
+    left, right = sides[0][:, :, None, :], sides[1][:, None, :, :]
+    full = np.broadcast_shapes(left.shape, right.shape)
+    kind = kind_of(eqn.outvars[0].aval.dtype)
+    terms = [build.map("convert_element_type", value, kind=kind) for value in (x, y)]
+    terms = [build.take(v, np.broadcast_to(p, full))
+             for v, p in zip(terms, (left, right), strict=True)]  # fmt: skip
+    return build.fold("add", build.map("mul", *terms), eqn.outvars[0].aval.shape)
+
+
+def _cumulative(op: str) -> Rule:
+    def rule(build: Builder, eqn: core.JaxprEqn, x: Value) -> Value:
+        axis, backwards = eqn.params["axis"], eqn.params["reverse"]
+        rows = list(np.moveaxis(x.places, axis, 0))
+        found: list[Value] = []
+        for row in rows[::-1] if backwards else rows:
+            term = build.take(x, row)
+            found.append(build.map(op, found[-1], term) if found else term)
+        return build.rows(np.stack, found[::-1] if backwards else found, axis)
+
+    return rule
+
+
+def _sort(build: Builder, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
+    """Each number's rank is how many come before it; the inverse of the ranks is the order."""
+    axis, keys = eqn.params["dimension"], eqn.params["num_keys"]
+    order = _order(build, [_along(build, x, axis) for x in args[:keys]])
+    rows, n = args[0].size // order.shape[-1], order.shape[-1]
+    first = build.const((np.arange(rows, dtype=np.int32) * n)[:, None].repeat(n, 1))
+    address = build.map("add", build.take(order, order.places.reshape(rows, n)), first)
+    found = [_lookup(build, _along(build, x, axis), address) for x in args]
+    shape = np.moveaxis(args[0].places, axis, -1).shape
+    back = np.moveaxis(np.arange(args[0].size).reshape(shape), -1, axis)
+    return [build.take(x, back) for x in found]
+
+
+def _along(build: Builder, x: Value, axis: int) -> Value:
+    return build.take(x, np.moveaxis(x.places, axis, -1))
+
+
+def _order(build: Builder, keys: Sequence[Value]) -> Value:
+    """Returns which number is at each place of the sorted rows [..., n]: NaN last, and stable."""
+    places = keys[0].places
+    n = places.shape[-1]
+    full = (*places.shape, n)
+    one, other = np.broadcast_to(places[..., None], full), np.broadcast_to(places[..., None, :], full)
+    number = np.arange(n)
+    before: Value = build.const(np.broadcast_to(number[None, :] < number[:, None], full))
+    for key in reversed(keys):
+        x, y = build.take(key, one), build.take(key, other)
+        less, equal = (build.map(op, y, x, kind="b") for op in ("lt", "eq"))
+        if key.kind == "f":
+            x_is, y_is = (build.map("ne", v, v, kind="b") for v in (x, y))
+            less = build.map("or", less, build.map("and", x_is, build.map("not", y_is)))
+            equal = build.map("or", equal, build.map("and", x_is, y_is))
+        before = build.map("or", less, build.map("and", equal, before))
+    rank = build.fold("add", build.map("convert_element_type", before, kind="i"), places.shape)
+    here = build.take(rank, np.broadcast_to(places[..., None, :], full))
+    wanted = build.const(np.broadcast_to(number[:, None], full).astype(np.int32))
+    mine = build.const(np.broadcast_to(number[None, :], full).astype(np.int32))
+    equal = build.map("eq", here, wanted, kind="b")
+    zero = build.const(np.zeros(full, np.int32))
+    return build.fold("add", build.map("select_n", equal, zero, mine, kind="i"), places.shape)
+
+
+def _top_k(build: Builder, eqn: core.JaxprEqn, x: Value) -> list[Value]:
+    """The greatest k of the last axis, and where they were: NaN first, then as sorted."""
+    n, k = x.shape[-1], eqn.params["k"]
+    order = _order(build, [build.map("neg", x)])
+    if x.kind == "f":
+        nan = build.map("ne", x, x, kind="b")
+        order = _order(build, [build.map("not", nan), build.map("neg", x)])
+    order = build.take(order, order.places[..., :k])
+    first = (np.arange(x.size // n, dtype=np.int32) * n).reshape(*x.shape[:-1], 1)
+    first = build.const(np.broadcast_to(first, order.shape))
+    return [_lookup(build, x, build.map("add", order, first)), order]
+
+
+# --- linear systems ---
+
+
+def _cholesky(build: Builder, eqn: core.JaxprEqn, matrix: Value) -> Value:
+    if len(matrix.shape) != 2:
+        raise NoRuleError("a batch of matrices")
+    return build.linear("cholesky", matrix)
+
+
+def _solve(build: Builder, eqn: core.JaxprEqn, matrix: Value, sides: Value) -> Value:
+    p = eqn.params
+    if len(matrix.shape) != 2 or not p["left_side"] or p["unit_diagonal"]:
+        raise NoRuleError("a batch, a system from the right, or one with ones on its diagonal")
+    which = {"lower": p["lower"], "transposed": bool(p["transpose_a"])}
+    matrix = _whole_matrix(build, matrix, p["lower"])
+    columns = [build.take(sides, places) for places in sides.places.T]
+    return build.rows(np.stack, [build.linear("solve", matrix, x, **which) for x in columns], -1)
+
+
+def _whole_matrix(build: Builder, matrix: Value, lower: bool) -> Value:
+    """Returns a matrix that stands in memory and has the half that is read.
+
+    JAX puts zeros into the other half of a factor. Without that a factor is read where it stands.
+    """
+    half = np.tril(matrix.places) if lower else np.triu(matrix.places)
+    read = np.flatnonzero(half.reshape(-1) + (matrix.places == 0).reshape(-1))
+    if isinstance(matrix, View):
+        sources = {matrix.sources[i] for i in np.unique(matrix.which[read])}
+        if len(sources) == 1 and (matrix.index[read] == read).all():
+            (source,) = sources
+            if not isinstance(source, Const) and source.size == matrix.size:
+                return source
+    return build.map("copy", matrix) if isinstance(matrix, Const) else build.standing(matrix)
+
+
+RULES: dict[str, Rule] = {
+    **dict.fromkeys(OPERATIONS.keys() - {"lookup"}, _elementwise),
+    "argmax": _first_of("max"),
+    "argmin": _first_of("min"),
+    "broadcast_in_dim": _place(_broadcast),
+    "cholesky": _cholesky,
+    "clamp": _clamp,
+    "concatenate": lambda build, eqn, *xs: build.rows(np.concatenate, xs, eqn.params["dimension"]),
+    "cummax": _cumulative("max"),
+    "cumprod": _cumulative("mul"),
+    "cumsum": _cumulative("add"),
+    "dot_general": _dot,
+    "dynamic_slice": _dynamic_slice,
+    "dynamic_update_slice": _dynamic_update,
+    "expand_dims": _reshape,
+    "gather": _gather,
+    "optimization_barrier": _same,
+    "pad": _pad,
+    "reduce_and": _reduce("and"),
+    "reduce_max": _reduce("max"),
+    "reduce_min": _reduce("min"),
+    "reduce_or": _reduce("or"),
+    "reduce_prod": _reduce("mul"),
+    "reduce_sum": _reduce("add"),
+    "reshape": _reshape,
+    "rev": _place(lambda p, places: np.flip(places, p["dimensions"])),
+    **dict.fromkeys(("scatter", "scatter-add", "scatter_add", "scatter-mul", "scatter_mul"), _scatter),
+    "slice": _place(_sliced),
+    "sort": _sort,
+    "split": _split,
+    "squeeze": _reshape,
+    "stack": lambda build, eqn, *xs: build.rows(np.stack, xs, eqn.params["axis"]),
+    "stop_gradient": _same,
+    "tile": _place(lambda p, places: np.tile(places, p.get("reps", p.get("repeats")))),
+    "top_k": _top_k,
+    "transpose": _place(lambda p, places: np.transpose(places, p["permutation"])),
+    "triangular_solve": _solve,
+}  # fmt: skip
