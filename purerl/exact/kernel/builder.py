@@ -89,11 +89,9 @@ class Builder:
             return self.const(np.zeros(shape, DTYPES[kind]))
         spread = [x if x.shape == shape else self.spread(x, shape) for x in args]
         arrays = [x.array for x in spread if isinstance(x, Const)]
-        if len(arrays) == len(args):
+        if len(arrays) == len(args) and op != "lookup":
             with np.errstate(all="ignore"):
-                array = computed(op, kind, param, *arrays)
-            if array is not None:
-                return self.const(array)
+                return self.const(computed(op, kind, param, *arrays))
         simple = self._simplified(op, kind, spread)
         if simple is not None:
             return simple
@@ -103,8 +101,8 @@ class Builder:
         return self._once(key, new, reads)
 
     def standing(self, value: Value) -> Value:
-        """Returns the value as one that stands in memory by itself, or a constant."""
-        if not isinstance(value, View):
+        """Returns the value as one that can stand in memory by itself."""
+        if not isinstance(value, View | Const):
             return value
         new = Map(value.shape, value.kind, self.top, "copy", [value])
         return self._once(("standing", id(value)), new, [value])

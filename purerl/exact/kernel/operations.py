@@ -15,7 +15,7 @@ class Operation(NamedTuple):
     """What one operation is."""
 
     text: str | Callable[[str, Any], str]  # "({} + {})"; or made from (kind, parameter)
-    compute: Callable[..., Any] | None = None  # by numpy; None: not before the kernel runs
+    compute: Callable[..., Any] | None = None  # by numpy; None: see `computed`
     cost: int = 1  # in additions, roughly
 
 
@@ -57,7 +57,7 @@ OPERATIONS = {
     "square": Operation("({0}*{0})", np.square),
     "integer_pow": Operation(_power),
     "sqrt": _call("sqrtf", np.sqrt, 8),
-    "rsqrt": Operation("(1.0f/sqrtf({}))", None, 16),
+    "rsqrt": Operation("(1.0f/sqrtf({}))", lambda x: 1 / np.sqrt(x), 16),
     "cbrt": _call("cbrtf", np.cbrt),
     "sin": _call("sinf", np.sin),
     "cos": _call("cosf", np.cos),
@@ -73,9 +73,9 @@ OPERATIONS = {
     "expm1": _call("expm1f", np.expm1),
     "log": _call("logf", np.log, 12),
     "log1p": _call("log1pf", np.log1p),
-    "logistic": Operation("(1.0f/(1.0f + expf(-{})))", None, 20),
+    "logistic": Operation("(1.0f/(1.0f + expf(-{})))", lambda x: 1 / (1 + np.exp(-x)), 20),
     "atan2": Operation("atan2f({}, {})", np.arctan2, 40),
-    "pow": Operation("powf({}, {})", None, 40),
+    "pow": Operation("powf({}, {})", np.power, 40),
     "rem": Operation(
         lambda kind, _: "fmodf({}, {})" if kind == "f" else "rest_of({}, {})", _remainder, 10
     ),
@@ -112,8 +112,8 @@ def text_of(op: str, kind: str, param: Any, *args: str) -> str:
     return (text if isinstance(text, str) else text(kind, param)).format(*args)
 
 
-def computed(op: str, kind: str, param: Any, *arrays: np.ndarray) -> np.ndarray | None:
-    """Returns the result of an operation on arrays; None if only the kernel computes it."""
+def computed(op: str, kind: str, param: Any, *arrays: np.ndarray) -> np.ndarray:
+    """Returns the result of an operation on arrays."""
     dtype = DTYPES[kind]
     if op == "convert_element_type":
         return (arrays[0] != 0) if kind == "b" else arrays[0].astype(dtype)
@@ -123,4 +123,4 @@ def computed(op: str, kind: str, param: Any, *arrays: np.ndarray) -> np.ndarray 
         quotient = np.true_divide(*arrays)
         return (quotient if kind == "f" else np.trunc(quotient)).astype(dtype)
     compute = OPERATIONS[op].compute
-    return None if compute is None else np.asarray(compute(*arrays), dtype)
+    return np.asarray(arrays[0] if compute is None else compute(*arrays), dtype)

@@ -92,7 +92,8 @@ def _lookup(build: Builder, table: Value, index: Value) -> Value:
     if isinstance(index, Const):
         return build.take(table, index.array)
     if table.size > FEW:
-        return build.map("lookup", index, kind=table.kind, param=build.standing(table))
+        table = table if isinstance(table, Const) else build.standing(table)
+        return build.map("lookup", index, kind=table.kind, param=table)
     rows = [build.spread(build.take(table, np.array(i)), index.shape) for i in range(table.size)]
     return _select_of_many(build, index, *rows)
 
@@ -343,26 +344,27 @@ def _solve(build: Builder, eqn: core.JaxprEqn, matrix: Value, sides: Value) -> V
     p = eqn.params
     if len(matrix.shape) != 2 or not p["left_side"] or p["unit_diagonal"]:
         raise NoRuleError("a batch, a system from the right, or one with ones on its diagonal")
-    which = {"lower": p["lower"], "transposed": bool(p["transpose_a"])}
-    matrix = _whole_matrix(build, matrix, p["lower"])
+    matrix, turned = _whole_matrix(build, matrix, p["lower"])
+    which = {"lower": p["lower"] != turned, "transposed": bool(p["transpose_a"]) != turned}
     columns = [build.take(sides, places) for places in sides.places.T]
     return build.rows(np.stack, [build.linear("solve", matrix, x, **which) for x in columns], -1)
 
 
-def _whole_matrix(build: Builder, matrix: Value, lower: bool) -> Value:
-    """Returns a matrix that stands in memory and has the half that is read.
+def _whole_matrix(build: Builder, matrix: Value, lower: bool) -> tuple[Value, bool]:
+    """Returns a matrix that stands in memory, or its transpose, and tells if it is that.
 
-    JAX puts zeros into the other half of a factor. Without that a factor is read where it stands.
+    It has the half that is read. JAX puts zeros into the other half of a factor, and may transpose
+    it; here the factor is read where it stands.
     """
-    half = np.tril(matrix.places) if lower else np.triu(matrix.places)
-    read = np.flatnonzero(half.reshape(-1) + (matrix.places == 0).reshape(-1))
     if isinstance(matrix, View):
-        sources = {matrix.sources[i] for i in np.unique(matrix.which[read])}
-        if len(sources) == 1 and (matrix.index[read] == read).all():
-            (source,) = sources
-            if not isinstance(source, Const) and source.size == matrix.size:
-                return source
-    return build.map("copy", matrix) if isinstance(matrix, Const) else build.standing(matrix)
+        half = (np.tril if lower else np.triu)(np.ones(matrix.shape, bool))
+        sources = {matrix.sources[i] for i in np.unique(matrix.which.reshape(half.shape)[half])}
+        index, (source, *others) = matrix.index.reshape(half.shape), sources
+        whole = not others and not isinstance(source, Const) and source.size == matrix.size
+        for turned, places in ((False, matrix.places), (True, matrix.places.T)):
+            if whole and (index == places)[half].all():
+                return source, turned
+    return build.standing(matrix), False
 
 
 RULES: dict[str, Rule] = {

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from purerl.exact.kernel import keeping
+from purerl.exact.kernel.levels import levels_of
 from purerl.exact.kernel.reading import Program
 from purerl.exact.kernel.values import (
     Block,
@@ -105,7 +106,7 @@ class StepStatement:
 
     def reads(self) -> set[Value]:
         """Returns what has to stand in memory before it, by its home."""
-        found = _read_by(self.copies).union(*(plan.outside for plan in self.plans))
+        found = read_by(self.copies).union(*(plan.outside for plan in self.plans))
         if isinstance(self.step, Linear):
             found |= {home(x) for x in self.step.reads[:-1]}
         return (found | (self.which.reads() if self.which else set())) - set(self.writes)
@@ -125,11 +126,11 @@ class Plan:
         """Works out `outside`."""
         statements = [x for level in self.levels for x in level]
         written = {home(x) for statement in statements for x in statement.writes}
-        read = _read_by(self.copies).union(*(x.reads() for x in statements))
+        read = read_by(self.copies).union(*(x.reads() for x in statements))
         self.outside = (read | (self.test.reads() if self.test else set())) - written
 
 
-def _read_by(copies: Sequence[tuple[Value, Code]]) -> set[Value]:
+def read_by(copies: Sequence[tuple[Value, Code]]) -> set[Value]:
     return set().union(*(code.reads() for _, code in copies))
 
 
@@ -175,8 +176,10 @@ class Scheduler:
                 statements.append(Statement([aside], code))
                 code = self._copy(aside)
             copies.append((home(target), code))
-        levels = [merged(level) for level in _levels(statements)]
-        return Plan(levels, copies, self._copy(test) if test else None, in_step)
+        tested = self._copy(test) if test else None
+        at_end = read_by(copies) | (tested.reads() if tested else set())
+        levels = [merged(level) for level in levels_of(statements, at_end)]
+        return Plan(levels, copies, tested, in_step)
 
     def _copy(self, value: Value) -> Code:
         return self.code(value, np.arange(value.size))
@@ -249,8 +252,7 @@ class _Expression:
         if value.op == "lookup":
             param = len(self.into.tables)
             self.into.tables.append(value.param)
-        kinds = value.args[0].kind if value.op == "rem" else value.kind
-        self.into.lines.append(Line(value.op, kinds, param, args))
+        self.into.lines.append(Line(value.op, value.kind, param, args))
         return len(self.into.lines) - 1
 
     def _mixed(self, value: View, which: np.ndarray, index: np.ndarray) -> int:
@@ -266,19 +268,6 @@ class _Expression:
     def _leaf(self, leaf: Leaf) -> int:
         self.into.leaves.append(leaf)
         return ~(len(self.into.leaves) - 1)
-
-
-def _levels(statements: Sequence[Any]) -> list[list[Any]]:
-    """Puts each statement into the first level after those of all that it reads."""
-    level_of: dict[Value, int] = {}
-    levels: list[list[Any]] = []
-    for statement in statements:  # each after what it reads
-        level = 1 + max((level_of[x] for x in statement.reads() if x in level_of), default=-1)
-        level_of |= {home(x): level for x in statement.writes}
-        if level == len(levels):
-            levels.append([])
-        levels[level].append(statement)
-    return levels
 
 
 def merged(level: Sequence[Any]) -> list[Any]:

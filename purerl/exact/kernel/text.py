@@ -10,8 +10,8 @@ from purerl.exact.kernel import indices, memory, operations
 from purerl.exact.kernel.lanes import LANES, width_of
 from purerl.exact.kernel.reading import Program
 from purerl.exact.kernel.schedule import (
-    SLOTS,
     Code,
+    Line,
     Leaf,
     Plan,
     Scheduler,
@@ -131,11 +131,10 @@ class _Writer:
         for number, line in enumerate(code.lines):
             args = [_name(arg) for arg in line.args]
             text = self._operation(code, line, args)
-            kind = "b" if line.op == "rem" else line.kind
             lines.append(f"{TYPES[line.kind]} t{number} = {text};")
         return lines, _name(code.result)
 
-    def _operation(self, code: Code, line, args: list[str]) -> str:
+    def _operation(self, code: Code, line: Line, args: list[str]) -> str:
         if line.op != "lookup":
             return operations.text_of(line.op, line.kind, line.param, *args)
         table = code.tables[line.param]
@@ -330,5 +329,3 @@ def _literal(number: float, kind: str) -> str:
         return "NAN"
     return f"{float(number)!r}f" if np.isfinite(number) else "INFINITY" if number > 0 else "-INFINITY"
 
-
-_ = SLOTS

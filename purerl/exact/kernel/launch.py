@@ -1,0 +1,141 @@
+"""A kernel as an operation of JAX: under `vmap` the batch is the grid.
+
+On a GPU XLA starts the PTX itself, as a part of its program. On a CPU the C++ is called back.
+"""
+
+import ctypes
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core
+from jax.interpreters import batching, mlir
+
+from purerl.exact.kernel import compilers
+from purerl.exact.kernel.text import Text
+
+DTYPES = {"f": np.float32, "i": np.int32, "b": np.int32}  # of the arrays that a kernel reads
+TARGETS = ("xla", "triton")  # ways to start PTX: XLA's own, and that of Pallas
+WITHOUT_A_GPU = 90  # compute capability for which a program is made where there is no GPU
+
+primitive = core.Primitive("kernel")
+primitive.multiple_results = True
+
+
+def run(text: Text, *arrays: Any, target: str = TARGETS[0]) -> list[jax.Array]:
+    """Runs a kernel on arrays [..., n], each of its kind; returns arrays [..., m]."""
+    return primitive.bind(*arrays, text=text, target=target)
+
+
+@primitive.def_impl
+def _now(*arrays: Any, **params: Any) -> list[jax.Array]:
+    return jax.jit(functools.partial(primitive.bind, **params))(*arrays)
+
+
+@primitive.def_abstract_eval
+def _shapes(*avals: Any, text: Text, target: str) -> list[jax.core.ShapedArray]:
+    batch = avals[0].shape[:-1]
+    assert all(aval.shape == (*batch, n) for aval, (n, _) in zip(avals, text.inputs, strict=True))
+    return [jax.core.ShapedArray((*batch, n), DTYPES[kind]) for n, kind in text.outputs]
+
+
+def _batched(arrays: Sequence[Any], axes: Sequence[int | None], **params: Any) -> tuple:
+    """Every environment has its own row of each array."""
+    size = next(x.shape[a] for x, a in zip(arrays, axes, strict=True) if a is not None)
+    rows = [
+        jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+        for x, axis in zip(arrays, axes, strict=True)
+    ]
+    return primitive.bind(*rows, **params), [0] * len(params["text"].outputs)
+
+
+batching.primitive_batchers[primitive] = _batched
+
+
+# --- on a CPU ---
+
+
+def _called_back(*arrays: Any, text: Text, target: str) -> Any:
+    batch = arrays[0].shape[:-1]
+    shapes = [jax.ShapeDtypeStruct((*batch, n), DTYPES[kind]) for n, kind in text.outputs]
+    host = functools.partial(on_host, compilers.on_cpu(text), text)
+    return jax.pure_callback(host, shapes, *arrays)
+
+
+def on_host(function: Any, text: Text, *arrays: Any) -> list[np.ndarray]:
+    """Calls the C++ of a kernel on arrays [..., n]."""
+    batch = np.shape(arrays[0])[:-1]
+    kinds = [DTYPES[kind] for _, kind in text.inputs]
+    given = [np.ascontiguousarray(x, kind) for x, kind in zip(arrays, kinds, strict=True)]
+    found = [np.empty((*batch, n), DTYPES[kind]) for n, kind in text.outputs]
+    count = np.array([int(np.prod(batch, dtype=int))], np.int32)
+    function(*(x.ctypes.data_as(ctypes.c_void_p) for x in (count, *given, *found)))
+    return found
+
+
+mlir.register_lowering(primitive, mlir.lower_fun(_called_back), platform="cpu")
+
+
+# --- on a GPU ---
+
+
+def _launched(ctx: Any, *nodes: Any, text: Text, target: str) -> Any:
+    """Lowers to a call of the kernel's PTX: a block for so many environments, a warp for each."""
+    environments = int(np.prod(ctx.avals_in[0].shape[:-1], dtype=int))
+    chip = _chip()
+    ptx = compilers.for_gpu(text, chip)
+    block = compilers.environments_of(text, chip)
+    launch = {"blocks": -(-environments // block), "warps": block, "bytes": 4 * text.memory * block}
+    count = mlir.ir_constant(np.array([environments], np.int32))
+    avals = [jax.core.ShapedArray((1,), np.int32), *ctx.avals_in]
+    call = _by_xla if target == "xla" else _by_triton
+    name, config = call(ptx, chip, launch, len(avals) + len(ctx.avals_out))
+    layouts = [[list(reversed(range(aval.ndim))) for aval in some] for some in (avals, ctx.avals_out)]
+    return mlir.custom_call(
+        call_target_name=name,
+        result_types=[mlir.aval_to_ir_type(aval) for aval in ctx.avals_out],
+        operands=[count, *nodes],
+        backend_config=config,
+        api_version=4,
+        operand_layouts=layouts[0],
+        result_layouts=layouts[1],
+    ).results
+
+
+def _by_xla(ptx: str, chip: int, launch: dict[str, int], arrays: int) -> tuple[str, dict]:
+    """XLA's own call: it starts the kernel as one of its own, also in a command buffer."""
+    numbers = {"grid_x": launch["blocks"], "grid_y": 1, "grid_z": 1}
+    numbers |= {"block_x": 32 * launch["warps"], "block_y": 1, "block_z": 1}
+    numbers |= {"shared_mem_bytes": launch["bytes"]}
+    words = {"name": "kernel", "kernel_type": "ptx", "kernel_data": ptx}
+    config = {name: mlir.ir.StringAttr.get(word) for name, word in words.items()}
+    return "__gpu$xla.gpu.ptx", config | {n: mlir.i32_attr(x) for n, x in numbers.items()}
+
+
+def _by_triton(ptx: str, chip: int, launch: dict[str, int], arrays: int) -> tuple[str, dict]:
+    """The call of Pallas' Triton: jaxlib compiles the PTX, and starts it."""
+    import zlib
+
+    from jax._src.lib import gpu_triton
+
+    kernel = gpu_triton.TritonKernel("kernel", launch["warps"], 1, launch["bytes"], ptx, "", chip)
+    parameter = gpu_triton.create_array_parameter(0, 4)
+    call = gpu_triton.TritonKernelCall(kernel, launch["blocks"], 1, 1, [parameter] * arrays)
+    packed = zlib.compress(call.to_proto("kernel", b""))
+    words = {"name": "kernel", "opaque": packed}
+    return "triton_kernel_call_ffi", {n: mlir.ir.StringAttr.get(x) for n, x in words.items()}
+
+
+def _chip() -> int:
+    """Returns the compute capability of the GPU, as 90."""
+    try:
+        device = jax.local_devices(backend="gpu")[0]
+    except RuntimeError:
+        return WITHOUT_A_GPU
+    return int(str(device.compute_capability).replace(".", ""))
+
+
+mlir.register_lowering(primitive, _launched, platform="cuda")
