@@ -133,6 +133,8 @@ def _nvrtc() -> Any:
     wheels = [path for folder in folders for path in sorted(folder.glob("*/lib/libnvrtc.so.*"))]
     for name in (*map(str, wheels), "libnvrtc.so", "libnvrtc.so.13", "libnvrtc.so.12"):
         try:
+            for builtins in Path(name).parent.glob("libnvrtc-builtins.so.*") if "/" in name else ():
+                ctypes.CDLL(str(builtins))  # it looks for them by name, in the system's folders
             return ctypes.CDLL(name)
         except OSError:
             continue

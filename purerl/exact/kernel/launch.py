@@ -5,6 +5,7 @@ On a GPU XLA starts the PTX itself, as a part of its program. On a CPU the C++ i
 
 import ctypes
 import functools
+import zlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -81,51 +82,57 @@ mlir.register_lowering(primitive, mlir.lower_fun(_called_back), platform="cpu")
 
 # --- on a GPU ---
 
+launched = core.Primitive("kernel_launch")
+launched.multiple_results = True
 
-def _launched(ctx: Any, *nodes: Any, text: Text, target: str) -> Any:
+
+def _with_number(*arrays: Any, text: Text, target: str) -> list[jax.Array]:
+    """Adds the number of environments, which the kernel reads: its text is for any number."""
+    number = int(np.prod(arrays[0].shape[:-1], dtype=int))
+    return launched.bind(jnp.array([number], jnp.int32), *arrays, text=text, target=target)
+
+
+@launched.def_abstract_eval
+def _launched_shapes(number: Any, *avals: Any, text: Text, target: str) -> list[Any]:
+    return _shapes(*avals, text=text, target=target)
+
+
+def _launch(ctx: Any, *nodes: Any, text: Text, target: str) -> Any:
     """Lowers to a call of the kernel's PTX: a block for so many environments, a warp for each."""
-    environments = int(np.prod(ctx.avals_in[0].shape[:-1], dtype=int))
+    number = int(np.prod(ctx.avals_in[1].shape[:-1], dtype=int))
     chip = _chip()
-    ptx = compilers.for_gpu(text, chip)
     block = compilers.environments_of(text, chip)
-    launch = {"blocks": -(-environments // block), "warps": block, "bytes": 4 * text.memory * block}
-    count = mlir.ir_constant(np.array([environments], np.int32))
-    avals = [jax.core.ShapedArray((1,), np.int32), *ctx.avals_in]
-    call = _by_xla if target == "xla" else _by_triton
-    name, config = call(ptx, chip, launch, len(avals) + len(ctx.avals_out))
-    layouts = [[list(reversed(range(aval.ndim))) for aval in some] for some in (avals, ctx.avals_out)]
-    return mlir.custom_call(
-        call_target_name=name,
-        result_types=[mlir.aval_to_ir_type(aval) for aval in ctx.avals_out],
-        operands=[count, *nodes],
-        backend_config=config,
-        api_version=4,
-        operand_layouts=layouts[0],
-        result_layouts=layouts[1],
-    ).results
+    ptx, blocks, size = compilers.for_gpu(text, chip), -(-number // block), 4 * text.memory * block
+    if target == "xla":
+        name, config = _by_xla(ptx, blocks, block, size)
+    else:
+        name, config = _by_triton(ptx, blocks, block, size, chip, len(nodes) + len(text.outputs))
+    return jax.ffi.ffi_lowering(name, backend_config=config)(ctx, *nodes)
 
 
-def _by_xla(ptx: str, chip: int, launch: dict[str, int], arrays: int) -> tuple[str, dict]:
+def _by_xla(ptx: str, blocks: int, warps: int, size: int) -> tuple[str, dict[str, Any]]:
     """XLA's own call: it starts the kernel as one of its own, also in a command buffer."""
-    numbers = {"grid_x": launch["blocks"], "grid_y": 1, "grid_z": 1}
-    numbers |= {"block_x": 32 * launch["warps"], "block_y": 1, "block_z": 1}
-    numbers |= {"shared_mem_bytes": launch["bytes"]}
     words = {"name": "kernel", "kernel_type": "ptx", "kernel_data": ptx}
+    numbers = {"grid_x": blocks, "grid_y": 1, "grid_z": 1}
+    numbers |= {"block_x": 32 * warps, "block_y": 1, "block_z": 1, "shared_mem_bytes": size}
     config = {name: mlir.ir.StringAttr.get(word) for name, word in words.items()}
     return "__gpu$xla.gpu.ptx", config | {n: mlir.i32_attr(x) for n, x in numbers.items()}
 
 
-def _by_triton(ptx: str, chip: int, launch: dict[str, int], arrays: int) -> tuple[str, dict]:
-    """The call of Pallas' Triton: jaxlib compiles the PTX, and starts it."""
-    import zlib
+def _by_triton(
+    ptx: str, blocks: int, warps: int, size: int, chip: int, arrays: int
+) -> tuple[str, dict[str, Any]]:
+    """The call of Pallas' Triton: jaxlib compiles the PTX and starts it.
 
-    from jax._src.lib import gpu_triton
+    It adds two pointers to scratch memory after the arrays; a kernel that does not declare them
+    never reads them.
+    """
+    from jax._src.lib import gpu_triton  # JAX has no public way
 
-    kernel = gpu_triton.TritonKernel("kernel", launch["warps"], 1, launch["bytes"], ptx, "", chip)
-    parameter = gpu_triton.create_array_parameter(0, 4)
-    call = gpu_triton.TritonKernelCall(kernel, launch["blocks"], 1, 1, [parameter] * arrays)
-    packed = zlib.compress(call.to_proto("kernel", b""))
-    words = {"name": "kernel", "opaque": packed}
+    kernel = gpu_triton.TritonKernel("kernel", warps, 1, size, ptx, "", chip)
+    parameters = [gpu_triton.create_array_parameter(0, 4)] * arrays
+    call = gpu_triton.TritonKernelCall(kernel, blocks, 1, 1, parameters)
+    words = {"name": "kernel", "opaque": zlib.compress(call.to_proto("kernel", b""))}
     return "triton_kernel_call_ffi", {n: mlir.ir.StringAttr.get(x) for n, x in words.items()}
 
 
@@ -138,4 +145,5 @@ def _chip() -> int:
     return int(str(device.compute_capability).replace(".", ""))
 
 
-mlir.register_lowering(primitive, _launched, platform="cuda")
+mlir.register_lowering(primitive, mlir.lower_fun(_with_number), platform="cuda")
+mlir.register_lowering(launched, _launch, platform="cuda")
