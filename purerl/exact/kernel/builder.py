@@ -30,6 +30,8 @@ from purerl.exact.kernel.values import (
 SMALL = 256  # numbers: what is larger is not kept beyond its block to be computed once
 FEW_TERMS = 4  # a row of so few is written out, each term where it is needed
 MOST_WRITTEN_OUT = 8192
+# What a fold of nothing gives.
+NOTHING = {"add": 0, "mul": 1, "or": 0, "and": 1, "max": -np.inf, "min": np.inf}
 
 
 class Builder:
@@ -112,9 +114,7 @@ class Builder:
         shape, size = tuple(shape), int(np.prod(shape, dtype=int))
         terms = arg.size // size if size else 0
         if not terms:
-            assert op in ("add", "mul", "or", "and"), "a greatest of nothing"
-            start = op in ("mul", "and")
-            return self.const(np.full(shape, start, DTYPES[arg.kind]))
+            return self.const(np.full(shape, NOTHING[op], DTYPES[arg.kind]))
         if terms <= FEW_TERMS and arg.size <= MOST_WRITTEN_OUT or isinstance(arg, Const):
             rows = arg.places.reshape(-1, terms)
             found = self.pick(arg, rows[:, 0])

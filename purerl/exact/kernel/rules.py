@@ -279,6 +279,8 @@ def _cumulative(op: str) -> Rule:
 def _sort(build: Builder, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
     """Each number's rank is how many come before it; the inverse of the ranks is the order."""
     axis, keys = eqn.params["dimension"], eqn.params["num_keys"]
+    if not args[0].size:
+        return list(args)
     order = _order(build, [_along(build, x, axis) for x in args[:keys]])
     rows, n = args[0].size // order.shape[-1], order.shape[-1]
     first = build.const((np.arange(rows, dtype=np.int32) * n)[:, None].repeat(n, 1))
@@ -369,6 +371,7 @@ def _whole_matrix(build: Builder, matrix: Value, lower: bool) -> tuple[Value, bo
 
 RULES: dict[str, Rule] = {
     **dict.fromkeys(OPERATIONS.keys() - {"lookup"}, _elementwise),
+    "add_any": lambda build, eqn, x, y: build.map("add", x, y),
     "argmax": _first_of("max"),
     "argmin": _first_of("min"),
     "broadcast_in_dim": _place(_broadcast),
