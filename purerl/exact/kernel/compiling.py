@@ -1,7 +1,7 @@
 """`compile_kernel`: a function as one kernel, and the check that it computes the same."""
 
-import functools
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -11,9 +11,11 @@ from jax.extend import core
 
 from purerl.exact.kernel import compilers, launch, reading, text
 from purerl.exact.kernel.reading import Missing
+from purerl.exact.kernel.values import NoRuleError as NoRuleError
 
 
-class Kernel(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Kernel:
     """A function that is one kernel. It can be called as the function, also under `vmap`."""
 
     text: text.Text
@@ -75,13 +77,13 @@ def compile_kernel(f: Callable, *example: Any) -> Kernel:
       *example: its arguments, or `jax.ShapeDtypeStruct`s of the same shapes.
 
     Raises:
-      NoRuleError: the first equation that no kernel computes; `missing` lists them all.
+      NoRuleError: the first equation that no kernel computes; `kernel_missing` lists them all.
     """
     closed, tree, shapes = _traced(f, *example)
     return Kernel(text.written(reading.read(closed)), shapes, tree)
 
 
-def missing(f: Callable, *example: Any) -> list[Missing]:
+def kernel_missing(f: Callable, *example: Any) -> list[Missing]:
     """Lists what of a function no kernel computes, and where it was written; nothing: all is."""
     return reading.missing(_traced(f, *example)[0])
 
@@ -93,7 +95,7 @@ def _traced(f: Callable, *example: Any) -> tuple[core.ClosedJaxpr, Any, Any]:
     return closed, tree, shapes
 
 
-def compare(kernel: Kernel, f: Callable, *args: Any) -> Agreement:
+def kernel_agreement(kernel: Kernel, f: Callable, *args: Any) -> Agreement:
     """Compares a kernel with the function that it was made of.
 
     Args:
@@ -119,5 +121,3 @@ def agreement(found: np.ndarray, wanted: np.ndarray) -> Agreement:
     worst = float(np.sqrt((squares / np.maximum(sizes, tiny)).max(initial=0.0)))
     return Agreement(error, worst, off, found.size)
 
-
-_ = functools

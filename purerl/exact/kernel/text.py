@@ -37,6 +37,10 @@ class Text(NamedTuple):
     inputs: tuple[tuple[int, str], ...]  # size and kind of each
     outputs: tuple[tuple[int, str], ...]
 
+    def __repr__(self) -> str:
+        """Says how long it is: it stands in traces."""
+        return f"{self.statements} statements"
+
 
 def written(program: Program) -> Text:
     """Returns the text of a kernel."""
