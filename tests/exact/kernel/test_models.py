@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from purerl import exact
-from purerl.exact.kernel import compiling
+from purerl.exact.kernel import compilers, compiling
 from purerl.physics.engine_mjx import mjx_defaults
 from purerl.physics.interface import Physics
 from tests import quick
@@ -59,7 +59,7 @@ HEAP = """
   <option cone="elliptic" iterations="4" ls_iterations="6" impratio="2"/>
   <worldbody>
     <geom type="plane" size="2 2 1"/>
-    <body name="box" pos="0 0 0.099"><freejoint/><geom type="box" size="0.1 0.1 0.1" condim="4"/></body>
+    <body name="box" pos="0 0 0.1" quat="1 0.02 0.03 0.1"><freejoint/><geom type="box" size="0.1 0.1 0.1" condim="4"/></body>
     <body pos="0.02 0 0.249" quat="1 0.1 1 0"><freejoint/><geom type="capsule" size="0.05 0.1" condim="6"/></body>
     <body name="hand" mocap="true" pos="0.3 0 0.3"/>
     <body name="held" pos="0.3 0 0.3"><freejoint/><geom type="sphere" size="0.05"/></body>
@@ -122,3 +122,17 @@ def test_a_control_step_is_xlas(name, tmp_path):
     arrays = rows(*map(np.asarray, jax.tree.leaves(args)))
     one, warps = by_one_lane(kernel.text, *arrays), by_warps(kernel.text, *arrays, folder=tmp_path)
     assert all((x.view(np.int32) == y.view(np.int32)).all() for x, y in zip(one, warps, strict=True))
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_an_ants_control_step_is_xlas():
+    """Five substeps and the task's readings, from the air to the floor: contacts come and go."""
+    from purerl.envs import run
+
+    physics = run.build(run.Options(body="ant"), "jax").physics
+    kernel, found, (state, *_) = compared(physics, (), 16)
+    assert max(x.error for x in found) < 1e-4 and not sum(x.off for x in found), found
+    assert kernel.text.memory * 4 * compilers.MOST_ENVIRONMENTS <= 227 * 1024, "16 share a block"
+    heights = np.asarray(state.qpos)[:, 2]
+    assert (heights < physics.model.qpos0[2]).all(), "they have fallen"
