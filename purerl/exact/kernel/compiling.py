@@ -36,12 +36,15 @@ class Kernel:
         if tree != self.inputs:
             raise ValueError(f"The arguments are {tree}; the kernel is for {self.inputs}.")
         kinds = [launch.DTYPES[kind] for _, kind in self.text.inputs]
-        rows = [jnp.asarray(x).astype(kind).reshape(-1)
-                for x, kind in zip(leaves, kinds, strict=True)]  # fmt: skip
-        found = launch.run(self.text, *rows, target=target)
-        shapes, structure = jax.tree.flatten(self.shapes)
-        results = [x.reshape(s.shape).astype(s.dtype) for x, s in zip(found, shapes, strict=True)]
-        return jax.tree.unflatten(structure, results)
+        some = [jnp.asarray(x) for x in leaves if np.size(x)]
+        rows = [x.astype(kind).reshape(-1) for x, kind in zip(some, kinds, strict=True)]
+        found = iter(launch.run(self.text, *rows, target=target))
+
+        def result(like: Any) -> jax.Array:
+            row = next(found) if np.prod(like.shape) else jnp.zeros(0)
+            return row.reshape(like.shape).astype(like.dtype)
+
+        return jax.tree.map(result, self.shapes)
 
 
 class Agreement(NamedTuple):

@@ -100,7 +100,7 @@ def _launched_shapes(number: Any, *avals: Any, text: Text, target: str) -> list[
 def _launch(ctx: Any, *nodes: Any, text: Text, target: str) -> Any:
     """Lowers to a call of the kernel's PTX: a block for so many environments, a warp for each."""
     number = int(np.prod(ctx.avals_in[1].shape[:-1], dtype=int))
-    chip = _chip()
+    chip = capability()
     block = compilers.environments_of(text, chip)
     ptx, blocks, size = compilers.for_gpu(text, chip), -(-number // block), 4 * text.memory * block
     if target == "xla":
@@ -136,7 +136,7 @@ def _by_triton(
     return "triton_kernel_call_ffi", {n: mlir.ir.StringAttr.get(x) for n, x in words.items()}
 
 
-def _chip() -> int:
+def capability() -> int:
     """Returns the compute capability of the GPU, as 90."""
     try:
         device = jax.local_devices(backend="gpu")[0]

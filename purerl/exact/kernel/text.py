@@ -34,7 +34,7 @@ class Text(NamedTuple):
     memory: int  # numbers of 4 bytes for each environment
     live: int  # of these needed at once
     statements: int
-    inputs: tuple[tuple[int, str], ...]  # size and kind of each
+    inputs: tuple[tuple[int, str], ...]  # size and kind of each that is not empty
     outputs: tuple[tuple[int, str], ...]
 
     def __repr__(self) -> str:
@@ -48,7 +48,8 @@ def written(program: Program) -> Text:
     placed = memory.placed(scheduler, program.inputs)
     writer = _Writer(scheduler, placed)
     lines = list(writer.program(program))
-    sizes = [[(x.size, x.kind) for x in values] for values in (program.inputs, program.outputs)]
+    some = (program.inputs, program.outputs)
+    sizes = [[(x.size, x.kind) for x in values if x.size] for values in some]
     tables = [f"TABLE unsigned short T[] = {{{_numbers(writer.tables.places)}}};",
               f"TABLE unsigned int C_[] = {{{_numbers(writer.tables.constants, 'u')}}};"]  # fmt: skip
     body = "\n".join([f"#define MEMORY {placed.size}", "PRELUDE", *tables, *lines, ""])
@@ -69,13 +70,14 @@ class _Writer:
 
     def program(self, program: Program) -> Iterator[str]:
         """Yields the kernel: inputs are copied to memory, and results to the caller's arrays."""
-        words = [f"const {TYPES[x.kind]}* in{i}" for i, x in enumerate(program.inputs)]
-        words += [f"{TYPES[x.kind]}* out{i}" for i, x in enumerate(program.outputs)]
+        inputs = [x for x in program.inputs if x.size]
+        outputs = [x for x in self.scheduler.outputs if x.size]
+        words = [f"const {TYPES[x.kind]}* in{i}" for i, x in enumerate(inputs)]
+        words += [f"{TYPES[x.kind]}* out{i}" for i, x in enumerate(outputs)]
         yield f"KERNEL(const int* environments, {', '.join(words)}) {{\nBEGIN"
-        for number, value in enumerate(program.inputs):
-            if value.size:
-                to = self._memory(value.kind, f"{self.address[value]}+i")
-                yield f"{_each(value.size)} {to} = in{number}[e*{value.size}+i];"
+        for number, value in enumerate(inputs):
+            to = self._memory(value.kind, f"{self.address[value]}+i")
+            yield f"{_each(value.size)} {to} = in{number}[e*{value.size}+i];"
         lines = list(self._plan(self.scheduler.plan, copied=False))
         if self.scheduler.slots:
             slots = np.array(list(self.scheduler.slots), np.uint32).view(np.int32)
@@ -83,7 +85,7 @@ class _Writer:
             yield f"{_each(len(slots))} I[i] = (int)C_[{at}+i];"
         yield "SYNC;"
         yield from lines
-        names = {x: f"out{i}[e*{x.size}+i]" for i, x in enumerate(self.scheduler.outputs)}
+        names = {x: f"out{i}[e*{x.size}+i]" for i, x in enumerate(outputs)}
         yield "if (there) {"
         for value, code in self.scheduler.plan.copies:
             yield self._assign(names[value], value.size, code)

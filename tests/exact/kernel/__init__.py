@@ -44,5 +44,5 @@ extern "C" bool on_lanes(const int* count, {words}) {{
 
 
 def rows(*arrays):
-    """Returns arrays [environments, ...] as [environments, n]."""
-    return [np.reshape(x, (len(x), -1)) for x in arrays]
+    """Returns the arrays [environments, ...] that are not empty as [environments, n]."""
+    return [np.reshape(x, (len(x), -1)) for x in arrays if np.size(x)]
