@@ -122,7 +122,8 @@ class Builder:
                 found = self.map(op, found, self.pick(arg, rows[:, term]))
             return self.take(found, np.arange(size).reshape(shape))
         new = Fold(shape, arg.kind, self.top, op, arg, terms)
-        new.lanes = lanes.are_shared(new)
+        new.width = lanes.width_of(new)
+        new.shared = lanes.are_shared(new)
         return self._once(("fold", op, id(arg), shape), new, [arg])
 
     def take(self, value: Value, index: np.ndarray) -> Value:

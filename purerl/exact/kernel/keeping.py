@@ -28,7 +28,10 @@ from purerl.exact.kernel.values import (
 )
 
 MOST_REPEATED = 16  # additions that may be made again, in all, because numbers are read repeatedly
-CHEAP, FEW_USES, LARGE = 1, 4, 4096
+# A value that is read a few times is computed anew if that costs about as much as reading it; a large
+# one, which would take much memory, if it costs several times as much.
+FEW_USES, CHEAP = 4, 1
+LARGE, CHEAP_OF_LARGE = 400, 8
 
 
 def blocks_of(step: Step) -> list[Block]:
@@ -108,7 +111,8 @@ def kept(top: Block, outputs: list[Value]) -> set[Value]:
         if isinstance(item, Map) and uses.number[item]:
             _keep_what_repeats(item, keep, costs, uses)
             costs[item] = OPERATIONS[item.op].cost + sum(_cost(x, keep, costs) for x in item.args)
-            if item in keep and costs[item] <= CHEAP and _may_be_repeated(item, uses):
+            cheap = CHEAP_OF_LARGE if item.size >= LARGE else CHEAP
+            if item in keep and costs[item] <= cheap and _may_be_repeated(item, uses):
                 keep.remove(item)
         elif isinstance(item, Fold) and uses.number[item]:
             _keep_what_repeats(item, keep, costs, uses)
@@ -133,7 +137,7 @@ def _add_args(uses: Uses, item: Map | Fold, is_kept: bool) -> None:
 
 
 def _by_lanes(item: Map | Fold) -> bool:
-    return isinstance(item, Fold) and item.lanes
+    return isinstance(item, Fold) and item.shared
 
 
 def _is_kept(item: Map | Fold, uses: Uses) -> bool:
@@ -166,5 +170,5 @@ def _cost(value: Value, keep: set[Value], costs: dict[Value, int]) -> int:
 
 
 def _may_be_repeated(item: Map, uses: Uses) -> bool:
-    small = uses.number[item] <= FEW_USES and item.size <= LARGE
-    return small and uses.blocks[item] == {item.block} and item not in uses.as_they_stand
+    here = uses.blocks[item] == {item.block} and item not in uses.as_they_stand
+    return here and uses.number[item] <= FEW_USES

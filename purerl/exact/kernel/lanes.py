@@ -23,7 +23,7 @@ MOST_FACTORS = 4  # of its terms
 
 def are_shared(fold: Fold) -> bool:
     """Tells whether the lanes share the rows of a fold."""
-    return fold.terms >= LANES and (fold.size <= FEW_ROWS or bool(width_of(fold)))
+    return fold.terms >= LANES and (fold.size <= FEW_ROWS or fold.width > 0)
 
 
 def width_of(fold: Fold) -> int:

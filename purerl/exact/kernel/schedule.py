@@ -78,7 +78,7 @@ class Statement:
     code: Code
     fold: str = ""  # the operation between terms
     terms: int = 1
-    lanes: bool = False  # whether the lanes share each row
+    shared: bool = False  # whether the lanes share each row
 
     @property
     def size(self) -> int:
@@ -187,7 +187,7 @@ class Scheduler:
     def _statement(self, item: Map | Fold) -> Statement:
         if isinstance(item, Fold):
             code = self.code(item.arg, np.arange(item.arg.size).reshape(-1, item.terms))
-            return Statement([item], code, item.op, item.terms, item.lanes)
+            return Statement([item], code, item.op, item.terms, item.shared)
         code = Code()
         code.result = _Expression(self, code).compute(item, np.arange(item.size))
         return Statement([item], code)
@@ -274,7 +274,7 @@ def merged(level: Sequence[Any]) -> list[Any]:
     """Returns a level's statements with small ones that compute alike made one."""
     groups: dict[Any, list[Any]] = collections.defaultdict(list)
     for statement in level:
-        alone = isinstance(statement, StepStatement) or statement.lanes
+        alone = isinstance(statement, StepStatement) or statement.shared
         alone = alone or statement.size > MERGED or bool(statement.code.tables)
         groups[id(statement) if alone else _form(statement)].append(statement)
     return [x[0] if len(x) == 1 else _one_of(x) for x in groups.values()]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from purerl.exact.kernel import indices, memory, operations
-from purerl.exact.kernel.lanes import LANES, width_of
+from purerl.exact.kernel.lanes import LANES
 from purerl.exact.kernel.reading import Program
 from purerl.exact.kernel.schedule import (
     Code,
@@ -18,12 +18,13 @@ from purerl.exact.kernel.schedule import (
     Statement,
     StepStatement,
 )
-from purerl.exact.kernel.values import Choice, Const, Fold, Linear, Loop, Value, home
+from purerl.exact.kernel.values import Choice, Const, Fold, Linear, Loop, NoRuleError, Value, home
 
 # What follows is of the fastest build on an H200 (lab/2026-11-29-one-kernel-on-a-cpu.md).
 LOCKSTEP = 4  # levels from one barrier of a block to the next: its warps share fetched code
 FEW_TERMS = 20  # a row of no more is written out, one of more is a loop
 AT_ONCE = 128  # results that lanes sum in one loop: each takes a register
+MOST_MEMORY = 1 << 16  # numbers: their places are kept in 16 bits
 TYPES = {"f": "float", "i": "int", "b": "int"}
 
 
@@ -43,9 +44,14 @@ class Text(NamedTuple):
 
 
 def written(program: Program) -> Text:
-    """Returns the text of a kernel."""
+    """Returns the text of a kernel; NoRuleError if an environment needs too much memory."""
     scheduler = Scheduler(program)
     placed = memory.placed(scheduler, program.inputs)
+    if placed.size > MOST_MEMORY:
+        raise NoRuleError(
+            f"A kernel needs memory for {placed.size:,} numbers of each environment, and has room "
+            f"for {MOST_MEMORY:,}: leave this step to XLA."
+        )
     writer = _Writer(scheduler, placed)
     lines = list(writer.program(program))
     some = (program.inputs, program.outputs)
@@ -164,11 +170,11 @@ class _Writer:
             if plan.in_step and number % LOCKSTEP == 0:
                 yield "LOCKSTEP;"
             plain = [x for x in level if isinstance(x, Statement)]
-            shared = sorted((x for x in plain if x.lanes), key=_shape)
+            shared = sorted((x for x in plain if x.shared), key=_shape)
             for _, some in itertools.groupby(shared, _shape):
                 yield from self._shared(list(some))
             for statement in plain:
-                if not statement.lanes:
+                if not statement.shared:
                     yield self._fold(statement) if statement.fold else self._map(statement)
             for statement in level:
                 if isinstance(statement, StepStatement):
@@ -302,21 +308,20 @@ def _shape(statement: Statement) -> tuple[str, int, str]:
     return statement.fold, statement.terms, statement.writes[0].kind
 
 
-def _square(statement: Statement) -> int:
+def _width(statement: Statement) -> int:
     """Returns n if a shared fold's rows are a symmetric [n, n], else 0."""
     (fold,) = statement.writes
-    assert isinstance(fold, Fold)
-    return width_of(fold)
+    return fold.width if isinstance(fold, Fold) else 0
 
 
 def _distinct_rows(statement: Statement) -> list[int]:
     """Returns the rows to sum: of a symmetric square those of its lower half."""
-    n = _square(statement)
+    n = _width(statement)
     return [r * n + c for r in range(n) for c in range(r + 1)] or list(range(statement.size))
 
 
 def _mirrored(statement: Statement, row: int) -> int:
-    n = _square(statement)
+    n = _width(statement)
     return row % n * n + row // n if n else row
 
 

@@ -90,7 +90,9 @@ class Fold(Value):
     op: str
     arg: Value
     terms: int
-    lanes: bool = False  # whether the lanes of a warp share each row: see `lanes.py`
+    # See `lanes.py`: n if the rows are a symmetric square [n, n], and whether lanes share each row.
+    width: int = 0
+    shared: bool = False
 
 
 @dataclass(eq=False)
