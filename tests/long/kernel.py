@@ -176,10 +176,14 @@ def rates(of: Subject, kernel: Callable, number: int) -> str:
 def main() -> int:
     """Tries all, prints the table."""
     plain = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("tests.long.kernel", description=__doc__, formatter_class=plain)
+    parser = argparse.ArgumentParser(
+        "tests.long.kernel", description=__doc__, formatter_class=plain
+    )
     parser.add_argument("--experiment", default="ant_run")
     parser.add_argument("--words", nargs=argparse.REMAINDER, default=[], help="of its command line")
-    parser.add_argument("--target", choices=launch.TARGETS, help="how to launch; else all are tried")
+    parser.add_argument(
+        "--target", choices=launch.TARGETS, help="how to launch; else all are tried"
+    )
     parser.add_argument("--only-digest", action="store_true", help=argparse.SUPPRESS)
     words = [x for x in sys.argv[1:] if x != "--only-digest"]
     options = parser.parse_args(words)
@@ -196,7 +200,11 @@ def main() -> int:
     ways = [options.target] if options.target else launch.TARGETS
     working = [way for way in ways if tried(f"rules, {way}", partial(rules, way))]
     made = tried("step", make, describe)
-    if made and tried("ptx", lambda: compilers.for_gpu(made.text, launch.capability()), lambda x: f"{len(x):,} bytes"):
+    if made and tried(
+        "ptx",
+        lambda: compilers.for_gpu(made.text, launch.capability()),
+        lambda x: f"{len(x):,} bytes",
+    ):
         way = (working or ways)[0]
         kernel = partial(made, target=way)
         tried("agreement", partial(agreement, of, kernel))
@@ -208,7 +216,9 @@ def main() -> int:
     for name, how, what in table:
         print(f"{name:18} {how:7} {what}")
     needed = {name: how for name, how, _ in table if not name.startswith("rules")}
-    go = working and {"step", "ptx", "agreement", "bits"} <= {n for n, how in needed.items() if how == "ok"}
+    go = working and {"step", "ptx", "agreement", "bits"} <= {
+        n for n, how in needed.items() if how == "ok"
+    }
     print("go: it launches, agrees and repeats itself" if go else "no-go")
     return 0 if go else 1
 

@@ -11,25 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from purerl.exact.kernel import lanes
+from purerl.exact.kernel import lanes, values
 from purerl.exact.kernel.operations import computed
-from purerl.exact.kernel.values import (
-    DTYPES,
-    Block,
-    Const,
-    Fold,
-    Held,
-    Linear,
-    Map,
-    Step,
-    Value,
-    View,
-    kind_of,
-)
+from purerl.exact.kernel.values import DTYPES, Const, Held, Map, Value, View, kind_of
 
 SMALL = 256  # numbers: what is larger is not kept beyond its block to be computed once
 FEW_TERMS = 4  # a row of so few is written out, each term where it is needed
 MOST_WRITTEN_OUT = 8192
+FEW = 4  # numbers: one of so few is chosen, one of more is read from memory
 # What a fold of nothing gives.
 NOTHING = {"add": 0, "mul": 1, "or": 0, "and": 1, "max": -np.inf, "min": np.inf}
 
@@ -39,14 +28,14 @@ class Builder:
 
     def __init__(self) -> None:
         """Begins a kernel."""
-        self.top = Block("top")
+        self.top = values.Block("top")
         self.blocks = [self.top]
         self._constants: dict[Any, Const] = {}
 
     @contextlib.contextmanager
-    def inside(self, role: str) -> Iterator[Block]:
+    def inside(self, role: str) -> Iterator[values.Block]:
         """Opens a block within the present one."""
-        block = Block(role, len(self.blocks))
+        block = values.Block(role, len(self.blocks))
         self.blocks.append(block)
         yield block
         self.blocks.pop()
@@ -65,19 +54,19 @@ class Builder:
         """Returns what a step or the caller is going to put into memory."""
         return Held(tuple(shape), kind_of(dtype), self.blocks[-1], home)
 
-    def step(self, step: Step) -> list[Held]:
+    def step(self, step: values.Step) -> list[Held]:
         """Adds a step to the present block; returns what it writes."""
         self.blocks[-1].items.append(step)
         return step.writes
 
-    def linear(self, op: str, *reads: Value, **which: bool) -> Held:
+    def linear(self, op: str, *reads: Value, **which: bool) -> Value:
         """Returns the result of a linear system (see `Linear`), which is solved once."""
         key = op, tuple(map(id, reads)), tuple(which.items())
         for block in self.blocks:
             if key in block.known:
                 return block.known[key]
         result = self.held(reads[-1].shape, np.float32)
-        self.step(Linear(self.blocks[-1], list(reads), [result], op, **which))
+        self.step(values.Linear(self.blocks[-1], list(reads), [result], op, **which))
         return self.blocks[-1].known.setdefault(key, result)
 
     def map(self, op: str, *args: Value, kind: str = "", param: Any = None) -> Value:
@@ -109,6 +98,23 @@ class Builder:
         new = Map(value.shape, value.kind, self.top, "copy", [value])
         return self._once(("standing", id(value)), new, [value])
 
+    def lookup(self, table: Value, index: Value) -> Value:
+        """Returns the numbers of a table at places, which have to be within it."""
+        if isinstance(index, Const):
+            return self.take(table, index.array)
+        if table.size > FEW:
+            table = table if isinstance(table, Const) else self.standing(table)
+            return self.map("lookup", index, kind=table.kind, param=table)
+        rows = [self.spread(self.take(table, np.array(i)), index.shape) for i in range(table.size)]
+        return self.select(index, *rows)
+
+    def select(self, which: Value, first: Value, *others: Value) -> Value:
+        """Returns of several values the one with a number, at each place."""
+        for number, other in enumerate(others, 1):
+            chosen = self.map("ge", which, self.const(np.int32(number)), kind="b")
+            first = self.map("select_n", chosen, first, other, kind=first.kind)
+        return first
+
     def fold(self, op: str, arg: Value, shape: Sequence[int]) -> Value:
         """Returns rows [*shape, terms] with each row made one number, in the order of its terms."""
         shape, size = tuple(shape), int(np.prod(shape, dtype=int))
@@ -121,7 +127,7 @@ class Builder:
             for term in range(1, terms):
                 found = self.map(op, found, self.pick(arg, rows[:, term]))
             return self.take(found, np.arange(size).reshape(shape))
-        new = Fold(shape, arg.kind, self.top, op, arg, terms)
+        new = values.Fold(shape, arg.kind, self.top, op, arg, terms)
         new.width = lanes.width_of(new)
         new.shared = lanes.are_shared(new)
         return self._once(("fold", op, id(arg), shape), new, [arg])
@@ -206,9 +212,8 @@ class Builder:
                 return other
             if kind == "b" and op in ("and", "or") and one.is_all(op == "or"):
                 return one
-        if isinstance(y, Const) and ((op == "sub" and y.is_all(0)) or (op == "div" and y.is_all(1))):
-            return x
-        return None
+        same = {"sub": 0, "div": 1}
+        return x if op in same and isinstance(y, Const) and y.is_all(same[op]) else None
 
 
 def _without_views(

@@ -1,4 +1,4 @@
-"""A kernel's text compiled: by g++ for this CPU, by NVRTC for a GPU. Compiled once for each machine.
+"""A kernel's text compiled: by g++ for this CPU, by NVRTC for a GPU.
 
 What was compiled is kept in JAX's compilation cache, if there is one, by the text, the compiler and
 what it compiles for.
@@ -21,8 +21,8 @@ import jax
 
 from purerl.exact.kernel.text import Text
 
-CPU_WORDS = ("-O1", "-std=c++17", "-fno-strict-aliasing", "-ffp-contract=off", "-w", "-shared", "-fPIC")
-GPU_WORDS = ("--std=c++17", "--extra-device-vectorization")
+CPU_WORDS = "-O1 -std=c++17 -w -shared -fPIC -fno-strict-aliasing -ffp-contract=off".split()  # noqa: SIM905
+GPU_WORDS = ("--std=c++17",)
 # Bytes of shared memory that a block can have, by compute capability; a chip that is not here has
 # at least what the smallest has.
 SHARED = {80: 163, 86: 99, 87: 163, 89: 99, 90: 227, 100: 227, 103: 227, 120: 99}
@@ -85,7 +85,7 @@ def on_cpu(text: Text) -> Callable[..., None]:
 
 
 def for_gpu(text: Text, chip: int) -> str:
-    """Returns PTX of the kernel for a compute capability, such as 90; CompilerError without NVRTC."""
+    """Returns PTX of the kernel for a compute capability, as 90; CompilerError without NVRTC."""
     library = _nvrtc()
     version = [ctypes.c_int(), ctypes.c_int()]
     library.nvrtcVersion(*map(ctypes.byref, version))
@@ -149,9 +149,7 @@ def key_of(whole: str, words: tuple[str, ...]) -> str:
     return hashlib.sha256("\0".join((whole, *words)).encode()).hexdigest()[:32]
 
 
-def _kept(
-    whole: str, words: tuple[str, ...], kind: str, make: Callable[[str], bytes]
-) -> Path:
+def _kept(whole: str, words: tuple[str, ...], kind: str, make: Callable[[str], bytes]) -> Path:
     """Returns the file of what was compiled; a process that is killed leaves no half of one."""
     folder = _folder()
     path = folder / f"{key_of(whole, words)}.{kind}"

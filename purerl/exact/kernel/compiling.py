@@ -27,7 +27,7 @@ class Kernel:
         """The kernel as C++ that is also CUDA."""
         return compilers.source(self.text)
 
-    def __call__(self, *args: Any, target: str = "xla") -> Any:
+    def __call__(self, *args: Any) -> Any:
         """Calls it on arguments of the shapes for which it was compiled.
 
         A loop of `vmap` makes of it one launch, with a warp for each environment.
@@ -38,7 +38,7 @@ class Kernel:
         kinds = [launch.DTYPES[kind] for _, kind in self.text.inputs]
         some = [jnp.asarray(x) for x in leaves if np.size(x)]
         rows = [x.astype(kind).reshape(-1) for x, kind in zip(some, kinds, strict=True)]
-        found = iter(launch.run(self.text, *rows, target=target))
+        found = iter(launch.run(self.text, *rows))
 
         def result(like: Any) -> jax.Array:
             row = next(found) if np.prod(like.shape) else jnp.zeros(0)
@@ -123,4 +123,3 @@ def agreement(found: np.ndarray, wanted: np.ndarray) -> Agreement:
     error = float(np.sqrt(squares.sum() / max(sizes.sum(), tiny)))
     worst = float(np.sqrt((squares / np.maximum(sizes, tiny)).max(initial=0.0)))
     return Agreement(error, worst, off, found.size)
-

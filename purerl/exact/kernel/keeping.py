@@ -1,8 +1,8 @@
 """Which values stand in memory, and which are computed anew wherever they are read.
 
 A map that is read once becomes a part of what reads it. One that is read more often is kept, unless
-it is so cheap that reading it costs as much as computing it. Terms of a sum along lanes are computed
-in the sum's own loop: there they would only take memory and a statement more.
+it is so cheap that reading it costs as much as computing it. Terms of a sum that lanes share are
+computed in the sum's own loop: there they would only take memory and a statement more.
 """
 
 import collections
@@ -11,50 +11,39 @@ from typing import Any
 
 import numpy as np
 
+from purerl.exact.kernel import values
 from purerl.exact.kernel.lanes import LANES
 from purerl.exact.kernel.operations import OPERATIONS
-from purerl.exact.kernel.values import (
-    Block,
-    Choice,
-    Const,
-    Fold,
-    Held,
-    Linear,
-    Loop,
-    Map,
-    Step,
-    Value,
-    View,
-)
+from purerl.exact.kernel.values import Block, Fold, Map, Step, Value, View
 
 MOST_REPEATED = 16  # additions that may be made again, in all, because numbers are read repeatedly
-# A value that is read a few times is computed anew if that costs about as much as reading it; a large
-# one, which would take much memory, if it costs several times as much.
+# A value that is read a few times is computed anew if that costs about as much as reading it; a
+# large one, which would take much memory, if it costs several times as much.
 FEW_USES, CHEAP = 4, 1
 LARGE, CHEAP_OF_LARGE = 400, 8
 
 
 def blocks_of(step: Step) -> list[Block]:
     """Returns the blocks inside a step, in the order in which they run."""
-    if isinstance(step, Loop):
+    if isinstance(step, values.Loop):
         return [block for block in (step.test, step.inner) if block]
-    return step.branches if isinstance(step, Choice) else []
+    return step.branches if isinstance(step, values.Choice) else []
 
 
 def copied_by(step: Step) -> list[Value]:
     """Returns which of the values that a step reads are copied to where it writes."""
-    if isinstance(step, Loop):
+    if isinstance(step, values.Loop):
         return step.reads
-    return step.reads[-1:] if isinstance(step, Linear) else []
+    return step.reads[-1:] if isinstance(step, values.Linear) else []
 
 
 def read_inside(step: Step) -> Iterator[tuple[Value, Block]]:
     """Yields the values that a step reads at the end of a block inside of it."""
-    if isinstance(step, Loop):
+    if isinstance(step, values.Loop):
         yield from ((value, step.inner) for value in step.results)
         if step.test and step.going:
             yield step.going, step.test
-    if isinstance(step, Choice):
+    if isinstance(step, values.Choice):
         for block, results in zip(step.branches, step.results, strict=True):
             yield from ((value, block) for value in results)
 
@@ -166,7 +155,9 @@ def _cost(value: Value, keep: set[Value], costs: dict[Value, int]) -> int:
     """Returns what computing one number anew costs."""
     if isinstance(value, View):
         return max(_cost(source, keep, costs) for source in value.sources)
-    return 0 if value in keep or isinstance(value, Const | Held) else costs.get(value, 0)
+    return (
+        0 if value in keep or isinstance(value, values.Const | values.Held) else costs.get(value, 0)
+    )
 
 
 def _may_be_repeated(item: Map, uses: Uses) -> bool:

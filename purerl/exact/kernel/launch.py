@@ -5,7 +5,6 @@ On a GPU XLA starts the PTX itself, as a part of its program. On a CPU the C++ i
 
 import ctypes
 import functools
-import zlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,16 +18,15 @@ from purerl.exact.kernel import compilers
 from purerl.exact.kernel.text import Text
 
 DTYPES = {"f": np.float32, "i": np.int32, "b": np.int32}  # of the arrays that a kernel reads
-TARGETS = ("xla", "triton")  # ways to start PTX: XLA's own, and that of Pallas
 WITHOUT_A_GPU = 90  # compute capability for which a program is made where there is no GPU
 
 primitive = core.Primitive("kernel")
 primitive.multiple_results = True
 
 
-def run(text: Text, *arrays: Any, target: str = TARGETS[0]) -> list[jax.Array]:
+def run(text: Text, *arrays: Any) -> list[jax.Array]:
     """Runs a kernel on arrays [..., n], each of its kind; returns arrays [..., m]."""
-    return primitive.bind(*arrays, text=text, target=target)
+    return primitive.bind(*arrays, text=text)
 
 
 @primitive.def_impl
@@ -37,7 +35,7 @@ def _now(*arrays: Any, **params: Any) -> list[jax.Array]:
 
 
 @primitive.def_abstract_eval
-def _shapes(*avals: Any, text: Text, target: str) -> list[jax.core.ShapedArray]:
+def _shapes(*avals: Any, text: Text) -> list[jax.core.ShapedArray]:
     batch = avals[0].shape[:-1]
     assert all(aval.shape == (*batch, n) for aval, (n, _) in zip(avals, text.inputs, strict=True))
     return [jax.core.ShapedArray((*batch, n), DTYPES[kind]) for n, kind in text.outputs]
@@ -59,7 +57,7 @@ batching.primitive_batchers[primitive] = _batched
 # --- on a CPU ---
 
 
-def _called_back(*arrays: Any, text: Text, target: str) -> Any:
+def _called_back(*arrays: Any, text: Text) -> Any:
     batch = arrays[0].shape[:-1]
     shapes = [jax.ShapeDtypeStruct((*batch, n), DTYPES[kind]) for n, kind in text.outputs]
     host = functools.partial(on_host, compilers.on_cpu(text), text)
@@ -86,54 +84,33 @@ launched = core.Primitive("kernel_launch")
 launched.multiple_results = True
 
 
-def _with_number(*arrays: Any, text: Text, target: str) -> list[jax.Array]:
+def _with_number(*arrays: Any, text: Text) -> list[jax.Array]:
     """Adds the number of environments, which the kernel reads: its text is for any number."""
     number = int(np.prod(arrays[0].shape[:-1], dtype=int))
-    return launched.bind(jnp.array([number], jnp.int32), *arrays, text=text, target=target)
+    return launched.bind(jnp.array([number], jnp.int32), *arrays, text=text)
 
 
 @launched.def_abstract_eval
-def _launched_shapes(number: Any, *avals: Any, text: Text, target: str) -> list[Any]:
-    return _shapes(*avals, text=text, target=target)
+def _launched_shapes(number: Any, *avals: Any, text: Text) -> list[Any]:
+    return _shapes(*avals, text=text)
 
 
-def _launch(ctx: Any, *nodes: Any, text: Text, target: str) -> Any:
+def _launch(ctx: Any, *nodes: Any, text: Text) -> Any:
     """Lowers to a call of the kernel's PTX: a block for so many environments, a warp for each."""
     number = int(np.prod(ctx.avals_in[1].shape[:-1], dtype=int))
     chip = capability()
-    block = compilers.environments_of(text, chip)
-    ptx, blocks, size = compilers.for_gpu(text, chip), -(-number // block), 4 * text.memory * block
-    if target == "xla":
-        name, config = _by_xla(ptx, blocks, block, size)
-    else:
-        name, config = _by_triton(ptx, blocks, block, size, chip, len(nodes) + len(text.outputs))
+    warps = compilers.environments_of(text, chip)
+    name, config = by_xla(compilers.for_gpu(text, chip), text, -(-number // warps), warps)
     return jax.ffi.ffi_lowering(name, backend_config=config)(ctx, *nodes)
 
 
-def _by_xla(ptx: str, blocks: int, warps: int, size: int) -> tuple[str, dict[str, Any]]:
-    """XLA's own call: it starts the kernel as one of its own, also in a command buffer."""
+def by_xla(ptx: str, text: Text, blocks: int, warps: int) -> tuple[str, dict[str, Any]]:
+    """Returns XLA's own call of PTX: it starts it as one of its kernels, also in CUDA graphs."""
     words = {"name": "kernel", "kernel_type": "ptx", "kernel_data": ptx}
-    numbers = {"grid_x": blocks, "grid_y": 1, "grid_z": 1}
-    numbers |= {"block_x": 32 * warps, "block_y": 1, "block_z": 1, "shared_mem_bytes": size}
+    numbers = {"grid_x": blocks, "block_x": 32 * warps, "shared_mem_bytes": 4 * text.memory * warps}
+    numbers |= dict.fromkeys(("grid_y", "grid_z", "block_y", "block_z"), 1)
     config = {name: mlir.ir.StringAttr.get(word) for name, word in words.items()}
     return "__gpu$xla.gpu.ptx", config | {n: mlir.i32_attr(x) for n, x in numbers.items()}
-
-
-def _by_triton(
-    ptx: str, blocks: int, warps: int, size: int, chip: int, arrays: int
-) -> tuple[str, dict[str, Any]]:
-    """The call of Pallas' Triton: jaxlib compiles the PTX and starts it.
-
-    It adds two pointers to scratch memory after the arrays; a kernel that does not declare them
-    never reads them.
-    """
-    from jax._src.lib import gpu_triton  # JAX has no public way
-
-    kernel = gpu_triton.TritonKernel("kernel", warps, 1, size, ptx, "", chip)
-    parameters = [gpu_triton.create_array_parameter(0, 4)] * arrays
-    call = gpu_triton.TritonKernelCall(kernel, blocks, 1, 1, parameters)
-    words = {"name": "kernel", "opaque": zlib.compress(call.to_proto("kernel", b""))}
-    return "triton_kernel_call_ffi", {n: mlir.ir.StringAttr.get(x) for n, x in words.items()}
 
 
 def capability() -> int:

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from purerl.exact.kernel.schedule import SLOTS, Plan, Scheduler, Statement, StepStatement
+from purerl.exact.kernel.schedule import Scheduler
+from purerl.exact.kernel.statements import SLOTS, Plan, Statement, StepStatement
 from purerl.exact.kernel.values import Held, Value, home
 
 TRIES = 24
@@ -68,7 +69,7 @@ class _Clock:
                 if isinstance(statement, StepStatement):
                     self._step(statement)
         self.now += 1
-        for target, code in plan.copies:
+        for _, code in plan.copies:
             self.read(code.reads())
         if plan.test:
             self.read(plan.test.reads())
@@ -88,14 +89,14 @@ class _Clock:
 def placed(scheduler: Scheduler, inputs: Sequence[Held]) -> Memory:
     """Returns a place for every value but the outputs, which are copied to the caller's arrays."""
     clock = _Clock()
-    for value in inputs:
-        clock.write([value])
+    for one in inputs:
+        clock.write([one])
     clock.run(scheduler.plan)
     spans = [_Span(g, min(clock.first[x] for x in g), max(clock.last[x] for x in g))
              for g in clock.groups]  # fmt: skip
     tries = [_first_fit(spans, order, len(scheduler.slots)) for order in _orders(spans)]
     size, places = min(tries, key=lambda found: found[0])
-    address = {SLOTS: 0}
+    address: dict[Value, int] = {SLOTS: 0}
     for span, place in zip(spans, places, strict=True):
         for value in span.values:
             address[value] = place
@@ -115,9 +116,7 @@ def _orders(spans: Sequence[_Span]) -> Iterator[np.ndarray]:
         yield np.argsort(-sizes * times ** (0.0, 0.5, 1.0)[number % 3] * noise, kind="stable")
 
 
-def _first_fit(
-    spans: Sequence[_Span], order: np.ndarray, start: int
-) -> tuple[int, list[int]]:
+def _first_fit(spans: Sequence[_Span], order: np.ndarray, start: int) -> tuple[int, list[int]]:
     """Returns the memory's size and a place for each span: the first free one, in this order."""
     places = [0] * len(spans)
     done: list[tuple[int, int, int, int]] = []  # by place: (from, to, first, last)
@@ -134,4 +133,3 @@ def _first_fit(
         done.append((at, at + span.size, span.first, span.last))
         done.sort()
     return max([start, *(end for _, end, _, _ in done)]), places
-

@@ -23,10 +23,6 @@ def _compare(sign: str, compute: Callable) -> Operation:
     return Operation(f"({{}} {sign} {{}})", compute)
 
 
-def _call(name: str, compute: Callable | None, cost: int = 30) -> Operation:
-    return Operation(f"{name}({{}})", compute, cost)
-
-
 def _power(kind: str, exponent: int) -> str:
     """By multiplication: a square is the most frequent one."""
     times = "*".join(["{0}"] * abs(exponent)) or "1"
@@ -51,28 +47,10 @@ OPERATIONS = {
     "max": Operation("most({}, {})", np.maximum),
     "min": Operation("least({}, {})", np.minimum),
     "sign": Operation("sign_of({})", np.sign),
-    "floor": _call("floorf", np.floor, 1),
-    "ceil": _call("ceilf", np.ceil, 1),
-    "round": _call("rintf", np.round, 1),
     "square": Operation("({0}*{0})", np.square),
     "integer_pow": Operation(_power),
-    "sqrt": _call("sqrtf", np.sqrt, 8),
+    "sqrt": Operation("sqrtf({})", np.sqrt, 8),
     "rsqrt": Operation("(1.0f/sqrtf({}))", lambda x: 1 / np.sqrt(x), 16),
-    "cbrt": _call("cbrtf", np.cbrt),
-    "sin": _call("sinf", np.sin),
-    "cos": _call("cosf", np.cos),
-    "tan": _call("tanf", np.tan),
-    "asin": _call("asinf", np.arcsin),
-    "acos": _call("acosf", np.arccos),
-    "atan": _call("atanf", np.arctan),
-    "sinh": _call("sinhf", np.sinh),
-    "cosh": _call("coshf", np.cosh),
-    "tanh": _call("tanhf", np.tanh),
-    "exp": _call("expf", np.exp, 10),
-    "exp2": _call("exp2f", np.exp2, 10),
-    "expm1": _call("expm1f", np.expm1),
-    "log": _call("logf", np.log, 12),
-    "log1p": _call("log1pf", np.log1p),
     "logistic": Operation("(1.0f/(1.0f + expf(-{})))", lambda x: 1 / (1 + np.exp(-x)), 20),
     "atan2": Operation("atan2f({}, {})", np.arctan2, 40),
     "pow": Operation("powf({}, {})", np.power, 40),
@@ -89,12 +67,18 @@ OPERATIONS = {
     "or": _compare("|", np.bitwise_or),
     "xor": _compare("^", np.bitwise_xor),
     "not": Operation(lambda kind, _: "(!{})" if kind == "b" else "(~{})", np.invert),
-    "is_finite": _call("is_finite", np.isfinite, 1),
+    "is_finite": Operation("is_finite({})", np.isfinite),
     "select_n": Operation("({0} ? {2} : {1})", lambda which, no, yes: np.where(which, yes, no)),
     "convert_element_type": Operation(_convert),
     "copy": Operation("{}"),
     "lookup": Operation("{}"),  # of a place in the memory of another value: written by `text.py`
 }
+# Functions of C's and numpy's own names, and others.
+_SAME = "cbrt ceil cos cosh exp exp2 expm1 floor log log1p sin sinh tan tanh".split()  # noqa: SIM905
+_OTHERS = {"asin": "arcsin", "acos": "arccos", "atan": "arctan"}
+for _name, _numpy in (dict(zip(_SAME, _SAME, strict=True)) | _OTHERS).items():
+    OPERATIONS[_name] = Operation(f"{_name}f({{}})", getattr(np, _numpy), 20)
+OPERATIONS["round"] = Operation("rintf({})", np.round)
 _NEUTRAL = {"add": "0", "mul": "1", "or": "0"}
 
 

@@ -8,17 +8,10 @@ import numpy as np
 from jax.extend import core
 
 from purerl.exact import constants, traces, walk
+from purerl.exact.kernel import values
 from purerl.exact.kernel.builder import Builder
 from purerl.exact.kernel.rules import RULES
-from purerl.exact.kernel.values import (
-    Block,
-    Choice,
-    Const,
-    Held,
-    Loop,
-    NoRuleError,
-    Value,
-)
+from purerl.exact.kernel.values import Block, Const, Held, NoRuleError, Value
 
 
 class Program(NamedTuple):
@@ -115,14 +108,12 @@ def _while(reader: _Reader, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
         raise NoRuleError("a vmapped loop")
     n, m = p["cond_nconsts"], p["body_nconsts"]
     carry = reader._carry(args[n + m :])
-    test, (going,) = reader._round(
-        "while", carry, lambda *xs: run(p["cond_jaxpr"], *args[:n], *xs)
-    )
+    test, (going,) = reader._round("while", carry, lambda *xs: run(p["cond_jaxpr"], *args[:n], *xs))
     body, results = reader._round(
         "while", carry, lambda *xs: run(p["body_jaxpr"], *args[n : n + m], *xs)
     )
-    step = Loop(reader.build.blocks[-1], list(args[n + m :]), carry, body, results, None, test, going)
-    return list(reader.build.step(step))
+    here, starts = reader.build.blocks[-1], list(args[n + m :])
+    return [*reader.build.step(values.Loop(here, starts, carry, body, results, None, test, going))]
 
 
 def _scan(reader: _Reader, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
@@ -131,10 +122,8 @@ def _scan(reader: _Reader, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
     if len(args) > n + m or len(eqn.outvars) > m:
         return _written_out(reader, p, args, n, m)
     carry = reader._carry(args[n:])
-    body, results = reader._round(
-        "scan", carry, lambda *xs: reader.run(p["jaxpr"], *args[:n], *xs)
-    )
-    step = Loop(reader.build.blocks[-1], list(args[n:]), carry, body, results, p["length"])
+    body, results = reader._round("scan", carry, lambda *xs: reader.run(p["jaxpr"], *args[:n], *xs))
+    step = values.Loop(reader.build.blocks[-1], list(args[n:]), carry, body, results, p["length"])
     return list(reader.build.step(step))
 
 
@@ -162,8 +151,8 @@ def _cond(reader: _Reader, eqn: core.JaxprEqn, which: Value, *args: Value) -> li
             results.append(reader.run(branch, *args))
         blocks.append(block)
     writes = [reader.build.held(v.aval.shape, v.aval.dtype) for v in eqn.outvars]
-    number = reader.build.map("convert_element_type", which, kind="i")
-    step = Choice(reader.build.blocks[-1], [number], writes, blocks, results)
+    chosen = reader.build.map("convert_element_type", which, kind="i")
+    step = values.Choice(reader.build.blocks[-1], [chosen], writes, blocks, results)
     return list(reader.build.step(step))
 
 

@@ -12,28 +12,21 @@ import numpy as np
 from jax.extend import core
 
 from purerl.exact import scatters
+from purerl.exact.kernel import rules_of_rows
 from purerl.exact.kernel.builder import Builder
 from purerl.exact.kernel.operations import OPERATIONS
 from purerl.exact.kernel.values import Const, NoRuleError, Value, View, kind_of
 
-FEW = 4  # numbers: one of so few is chosen, one of more is read from memory
 Rule = Callable[..., Any]
 
 
 def _elementwise(build: Builder, eqn: core.JaxprEqn, *args: Value) -> Value:
     kind = kind_of(eqn.outvars[0].aval.dtype)
     if eqn.primitive.name == "select_n" and len(args) > 3:
-        return _select_of_many(build, *args)
+        return build.select(*args)
     if eqn.primitive.name in ("and", "or", "xor", "not") and kind == "f":
         raise NoRuleError("bits of real numbers")
     return build.map(eqn.primitive.name, *args, kind=kind, param=eqn.params.get("y"))
-
-
-def _select_of_many(build: Builder, which: Value, first: Value, *others: Value) -> Value:
-    for number, other in enumerate(others, 1):
-        chosen = build.map("ge", which, build.const(np.int32(number)), kind="b")
-        first = build.map("select_n", chosen, first, other, kind=first.kind)
-    return first
 
 
 def _clamp(build: Builder, eqn: core.JaxprEqn, low: Value, x: Value, high: Value) -> Value:
@@ -87,17 +80,6 @@ def _pad(build: Builder, eqn: core.JaxprEqn, x: Value, filler: Value) -> Value:
 # --- places that may be known only while running ---
 
 
-def _lookup(build: Builder, table: Value, index: Value) -> Value:
-    """Returns the numbers of a table at places, which have to be within it."""
-    if isinstance(index, Const):
-        return build.take(table, index.array)
-    if table.size > FEW:
-        table = table if isinstance(table, Const) else build.standing(table)
-        return build.map("lookup", index, kind=table.kind, param=table)
-    rows = [build.spread(build.take(table, np.array(i)), index.shape) for i in range(table.size)]
-    return _select_of_many(build, index, *rows)
-
-
 def _number(build: Builder, number: int) -> Value:
     return build.const(np.int32(number))
 
@@ -139,10 +121,10 @@ def _gather(build: Builder, eqn: core.JaxprEqn, x: Value, indices: Value) -> Val
     row = np.broadcast_to(row, shape)
     address = build.map("add", build.take(address, row), build.const(
         np.broadcast_to(inside, shape).astype(np.int32)))  # fmt: skip
-    found = _lookup(build, x, address)
+    found = build.lookup(x, address)
     if p["mode"] != jax.lax.GatherScatterMode.FILL_OR_DROP:
         return found
-    fits = build.const(np.ones(len(at), bool))
+    fits: Value = build.const(np.ones(len(at), bool))
     for one, other in zip(asked, starts, strict=True):
         fits = build.map("and", fits, build.map("eq", one, other, kind="b"))
     filler = build.spread(build.const(_filler(p["fill_value"], x.kind)), shape)
@@ -161,7 +143,7 @@ def _dynamic_slice(build: Builder, eqn: core.JaxprEqn, x: Value, *asked: Value) 
     starts = [_within(build, s, n - m) for s, n, m in zip(asked, x.shape, sizes, strict=True)]
     window = x.places[tuple(map(slice, sizes))].astype(np.int32)
     address = build.spread(_address(build, starts, _steps(x.shape)), window.shape)
-    return _lookup(build, x, build.map("add", address, build.const(window)))
+    return build.lookup(x, build.map("add", address, build.const(window)))
 
 
 def _dynamic_update(
@@ -176,7 +158,7 @@ def _dynamic_update(
         offsets.append(_within(build, offset, m - 1))
         fits = build.map("eq", offset, offsets[-1], kind="b")
         inside = build.map("and", inside, fits)
-    put = _lookup(build, new, _address(build, offsets, _steps(new.shape)))
+    put = build.lookup(new, _address(build, offsets, _steps(new.shape)))
     return build.map("select_n", inside, x, put, kind=x.kind)
 
 
@@ -201,136 +183,14 @@ def _scatter(build: Builder, eqn: core.JaxprEqn, x: Value, indices: Value, new: 
 
 def _turns(address: np.ndarray) -> list[np.ndarray]:
     """Splits updates into groups, in their order, so that no two of one meet at an address."""
-    turn_of, groups = {}, []  # type: ignore[var-annotated]
+    turn_of: dict[int, int] = {}
+    groups: list[list[int]] = []
     for update in np.flatnonzero(address >= 0):
         turn = turn_of.get(address[update], 0)
         turn_of[address[update]] = turn + 1
         groups += [[]] if turn == len(groups) else []
         groups[turn].append(update)
     return [np.array(group) for group in groups]
-
-
-# --- sums, and what else makes few numbers of many ---
-
-
-def _rows_of(x: Value, axes: Sequence[int]) -> tuple[np.ndarray, tuple[int, ...]]:
-    """Returns places with `axes` last, and the shape without them."""
-    kept = [axis for axis in range(len(x.shape)) if axis not in axes]
-    return np.transpose(x.places, [*kept, *axes]), tuple(x.shape[axis] for axis in kept)
-
-
-def _reduce(op: str) -> Rule:
-    def rule(build: Builder, eqn: core.JaxprEqn, x: Value) -> Value:
-        places, shape = _rows_of(x, eqn.params["axes"])
-        return build.fold(op, build.take(x, places), shape)
-
-    return rule
-
-
-def _first_of(op: str) -> Rule:
-    """The first of the greatest, or least; a NaN is before any number."""
-
-    def rule(build: Builder, eqn: core.JaxprEqn, x: Value) -> Value:
-        places, shape = _rows_of(x, eqn.params["axes"])
-        rows = build.take(x, places)
-        best = build.fold(op, rows, shape)
-        best = build.take(best, np.broadcast_to(best.places[..., None], places.shape))
-        equal = build.map("eq", rows, best, kind="b")
-        if x.kind == "f":
-            equal = build.map("or", equal, build.map("ne", rows, rows, kind="b"))
-        number = np.broadcast_to(np.arange(places.shape[-1], dtype=np.int32), places.shape)
-        beyond = build.const(np.full(places.shape, places.shape[-1], np.int32))
-        numbers = build.map("select_n", equal, beyond, build.const(number), kind="i")
-        return build.fold("min", numbers, shape)
-
-    return rule
-
-
-def _dot(build: Builder, eqn: core.JaxprEqn, x: Value, y: Value) -> Value:
-    sums, batch = eqn.params["dimension_numbers"]
-    sides = []
-    for value, summed, batched in zip((x, y), sums, batch, strict=True):
-        free = [i for i in range(len(value.shape)) if i not in (*summed, *batched)]
-        places = np.transpose(value.places, [*batched, *free, *summed])
-        parts = [[value.shape[i] for i in axes] for axes in (batched, free, summed)]
-        sides.append(places.reshape([int(np.prod(part, dtype=int)) for part in parts]))
-    left, right = sides[0][:, :, None, :], sides[1][:, None, :, :]
-    full = np.broadcast_shapes(left.shape, right.shape)
-    kind = kind_of(eqn.outvars[0].aval.dtype)
-    terms = [build.map("convert_element_type", value, kind=kind) for value in (x, y)]
-    terms = [build.take(v, np.broadcast_to(p, full))
-             for v, p in zip(terms, (left, right), strict=True)]  # fmt: skip
-    return build.fold("add", build.map("mul", *terms), eqn.outvars[0].aval.shape)
-
-
-def _cumulative(op: str) -> Rule:
-    def rule(build: Builder, eqn: core.JaxprEqn, x: Value) -> Value:
-        axis, backwards = eqn.params["axis"], eqn.params["reverse"]
-        rows = list(np.moveaxis(x.places, axis, 0))
-        found: list[Value] = []
-        for row in rows[::-1] if backwards else rows:
-            term = build.take(x, row)
-            found.append(build.map(op, found[-1], term) if found else term)
-        return build.rows(np.stack, found[::-1] if backwards else found, axis)
-
-    return rule
-
-
-def _sort(build: Builder, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
-    """Each number's rank is how many come before it; the inverse of the ranks is the order."""
-    axis, keys = eqn.params["dimension"], eqn.params["num_keys"]
-    if not args[0].size:
-        return list(args)
-    order = _order(build, [_along(build, x, axis) for x in args[:keys]])
-    rows, n = args[0].size // order.shape[-1], order.shape[-1]
-    first = build.const((np.arange(rows, dtype=np.int32) * n)[:, None].repeat(n, 1))
-    address = build.map("add", build.take(order, order.places.reshape(rows, n)), first)
-    found = [_lookup(build, _along(build, x, axis), address) for x in args]
-    shape = np.moveaxis(args[0].places, axis, -1).shape
-    back = np.moveaxis(np.arange(args[0].size).reshape(shape), -1, axis)
-    return [build.take(x, back) for x in found]
-
-
-def _along(build: Builder, x: Value, axis: int) -> Value:
-    return build.take(x, np.moveaxis(x.places, axis, -1))
-
-
-def _order(build: Builder, keys: Sequence[Value]) -> Value:
-    """Returns which number is at each place of the sorted rows [..., n]: NaN last, and stable."""
-    places = keys[0].places
-    n = places.shape[-1]
-    full = (*places.shape, n)
-    one, other = np.broadcast_to(places[..., None], full), np.broadcast_to(places[..., None, :], full)
-    number = np.arange(n)
-    before: Value = build.const(np.broadcast_to(number[None, :] < number[:, None], full))
-    for key in reversed(keys):
-        x, y = build.take(key, one), build.take(key, other)
-        less, equal = (build.map(op, y, x, kind="b") for op in ("lt", "eq"))
-        if key.kind == "f":
-            x_is, y_is = (build.map("ne", v, v, kind="b") for v in (x, y))
-            less = build.map("or", less, build.map("and", x_is, build.map("not", y_is)))
-            equal = build.map("or", equal, build.map("and", x_is, y_is))
-        before = build.map("or", less, build.map("and", equal, before))
-    rank = build.fold("add", build.map("convert_element_type", before, kind="i"), places.shape)
-    here = build.take(rank, np.broadcast_to(places[..., None, :], full))
-    wanted = build.const(np.broadcast_to(number[:, None], full).astype(np.int32))
-    mine = build.const(np.broadcast_to(number[None, :], full).astype(np.int32))
-    equal = build.map("eq", here, wanted, kind="b")
-    zero = build.const(np.zeros(full, np.int32))
-    return build.fold("add", build.map("select_n", equal, zero, mine, kind="i"), places.shape)
-
-
-def _top_k(build: Builder, eqn: core.JaxprEqn, x: Value) -> list[Value]:
-    """The greatest k of the last axis, and where they were: NaN first, then as sorted."""
-    n, k = x.shape[-1], eqn.params["k"]
-    order = _order(build, [build.map("neg", x)])
-    if x.kind == "f":
-        nan = build.map("ne", x, x, kind="b")
-        order = _order(build, [build.map("not", nan), build.map("neg", x)])
-    order = build.take(order, order.places[..., :k])
-    first = (np.arange(x.size // n, dtype=np.int32) * n).reshape(*x.shape[:-1], 1)
-    first = build.const(np.broadcast_to(first, order.shape))
-    return [_lookup(build, x, build.map("add", order, first)), order]
 
 
 # --- linear systems ---
@@ -370,41 +230,29 @@ def _whole_matrix(build: Builder, matrix: Value, lower: bool) -> tuple[Value, bo
 
 
 RULES: dict[str, Rule] = {
+    **rules_of_rows.RULES,
     **dict.fromkeys(OPERATIONS.keys() - {"lookup"}, _elementwise),
     "add_any": lambda build, eqn, x, y: build.map("add", x, y),
-    "argmax": _first_of("max"),
-    "argmin": _first_of("min"),
     "broadcast_in_dim": _place(_broadcast),
     "cholesky": _cholesky,
     "clamp": _clamp,
     "concatenate": lambda build, eqn, *xs: build.rows(np.concatenate, xs, eqn.params["dimension"]),
-    "cummax": _cumulative("max"),
-    "cumprod": _cumulative("mul"),
-    "cumsum": _cumulative("add"),
-    "dot_general": _dot,
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update,
     "expand_dims": _reshape,
     "gather": _gather,
     "optimization_barrier": _same,
     "pad": _pad,
-    "reduce_and": _reduce("and"),
-    "reduce_max": _reduce("max"),
-    "reduce_min": _reduce("min"),
-    "reduce_or": _reduce("or"),
-    "reduce_prod": _reduce("mul"),
-    "reduce_sum": _reduce("add"),
     "reshape": _reshape,
     "rev": _place(lambda p, places: np.flip(places, p["dimensions"])),
-    **dict.fromkeys(("scatter", "scatter-add", "scatter_add", "scatter-mul", "scatter_mul"), _scatter),
+    **dict.fromkeys(("scatter", "scatter-add", "scatter_add"), _scatter),
+    **dict.fromkeys(("scatter-mul", "scatter_mul"), _scatter),
     "slice": _place(_sliced),
-    "sort": _sort,
     "split": _split,
     "squeeze": _reshape,
     "stack": lambda build, eqn, *xs: build.rows(np.stack, xs, eqn.params["axis"]),
     "stop_gradient": _same,
     "tile": _place(lambda p, places: np.tile(places, p.get("reps", p.get("repeats")))),
-    "top_k": _top_k,
     "transpose": _place(lambda p, places: np.transpose(places, p["permutation"])),
     "triangular_solve": _solve,
 }  # fmt: skip

@@ -1,137 +1,15 @@
-"""From values to statements, in levels: no statement of a level reads what another of it writes.
+"""From values to statements, in levels: no statement of a level reads what another of it writes."""
 
-A statement computes all numbers of one kept value, or of several that are computed alike. Its text
-is that of one number: a line for each operation, and a leaf for each number that it reads.
-"""
-
-import collections
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from purerl.exact.kernel import keeping
+from purerl.exact.kernel import keeping, statements, values
 from purerl.exact.kernel.levels import levels_of
 from purerl.exact.kernel.reading import Program
-from purerl.exact.kernel.values import (
-    Block,
-    Choice,
-    Const,
-    Fold,
-    Held,
-    Linear,
-    Loop,
-    Map,
-    Step,
-    Value,
-    View,
-    home,
-)
-
-# Numbers of a statement that is made one with others of its kind. More of them, and where each
-# reads is no longer said in a few instructions.
-MERGED = 64
-# What stands for the memory of single constants, which a view mixes with numbers of values.
-SLOTS = Held((0,), "f", Block("top"))
-
-
-class Leaf(NamedTuple):
-    """A number that a statement reads: a constant's, or one of memory, for each place."""
-
-    kind: str
-    sources: tuple[Value, ...]  # homes, in memory; none: the numbers of `index` themselves
-    which: np.ndarray
-    index: np.ndarray
-
-
-class Line(NamedTuple):
-    """One operation of a statement's text; the arguments are numbers of lines, or ~ of leaves."""
-
-    op: str
-    kind: str
-    param: Any
-    args: tuple[int, ...]
-
-
-@dataclass
-class Code:
-    """How one number is computed, at each of some places."""
-
-    lines: list[Line] = field(default_factory=list)
-    leaves: list[Leaf] = field(default_factory=list)
-    result: int = 0
-    tables: list[Value] = field(default_factory=list)  # what is looked up in
-
-    def reads(self) -> set[Value]:
-        """Returns what has to stand in memory, by its home."""
-        found = {x for leaf in self.leaves for i, x in enumerate(leaf.sources)
-                 if x is not SLOTS and (leaf.which == i).any()}  # fmt: skip
-        return found | {home(x) for x in self.tables if not isinstance(x, Const)}
-
-
-@dataclass
-class Statement:
-    """Computes `writes`, side by side in memory; a fold's code is that of one term [rows, terms]."""
-
-    writes: list[Value]
-    code: Code
-    fold: str = ""  # the operation between terms
-    terms: int = 1
-    shared: bool = False  # whether the lanes share each row
-
-    @property
-    def size(self) -> int:
-        """How many numbers it computes."""
-        return sum(x.size for x in self.writes)
-
-    def reads(self) -> set[Value]:
-        """Returns what has to stand in memory before it, by its home."""
-        return self.code.reads()
-
-
-@dataclass
-class StepStatement:
-    """A step: what it copies to where it writes before it begins, and its inner blocks."""
-
-    step: Step
-    copies: list[tuple[Value, Code]]
-    plans: list["Plan"]
-    which: Code | None = None  # of a choice: the number of the branch
-
-    @property
-    def writes(self) -> list[Value]:
-        """The values that stand in memory after it."""
-        return list(self.step.writes)
-
-    def reads(self) -> set[Value]:
-        """Returns what has to stand in memory before it, by its home."""
-        found = read_by(self.copies).union(*(plan.outside for plan in self.plans))
-        if isinstance(self.step, Linear):
-            found |= {home(x) for x in self.step.reads[:-1]}
-        return (found | (self.which.reads() if self.which else set())) - set(self.writes)
-
-
-@dataclass
-class Plan:
-    """A block: its levels, then what is copied to the carry or to results, then what is tested."""
-
-    levels: list[list[Statement | StepStatement]]
-    copies: list[tuple[Value, Code]]
-    test: Code | None  # of a loop: whether it goes on
-    in_step: bool  # whether all environments run it equally often
-    outside: set[Value] = field(default_factory=set)  # what it reads of other blocks, by its home
-
-    def __post_init__(self) -> None:
-        """Works out `outside`."""
-        statements = [x for level in self.levels for x in level]
-        written = {home(x) for statement in statements for x in statement.writes}
-        read = read_by(self.copies).union(*(x.reads() for x in statements))
-        self.outside = (read | (self.test.reads() if self.test else set())) - written
-
-
-def read_by(copies: Sequence[tuple[Value, Code]]) -> set[Value]:
-    return set().union(*(code.reads() for _, code in copies))
+from purerl.exact.kernel.statements import SLOTS, Code, Leaf, Line, Plan, Statement, StepStatement
+from purerl.exact.kernel.values import Const, Fold, Held, Map, Value, View, home
 
 
 class Scheduler:
@@ -153,18 +31,18 @@ class Scheduler:
 
     def _plan(
         self,
-        block: Block,
+        block: values.Block,
         results: Sequence[Value] = (),
         into: Sequence[Held] = (),
         test: Value | None = None,
         in_step: bool = True,
     ) -> Plan:
-        statements: list[Any] = []
+        made: list[Any] = []
         for item in block.items:
-            if isinstance(item, Step):
-                statements.append(self._step(item, in_step))
+            if isinstance(item, values.Step):
+                made.append(self._step(item, in_step))
             elif item in self.keep:
-                statements.append(self._statement(item))
+                made.append(self._statement(item))
         copies, homes = [], {home(x) for x in into}
         for value, target in zip(results, into, strict=True):
             if home(value) is home(target) or not value.size:
@@ -173,12 +51,12 @@ class Scheduler:
             if code.reads() & homes:
                 # Copies are made one after another: what reads the carry is put aside before.
                 aside = Held(value.shape, value.kind, block)
-                statements.append(Statement([aside], code))
+                made.append(Statement([aside], code))
                 code = self._copy(aside)
             copies.append((home(target), code))
         tested = self._copy(test) if test else None
-        at_end = read_by(copies) | (tested.reads() if tested else set())
-        levels = [merged(level) for level in levels_of(statements, at_end)]
+        at_end = statements.read_by(copies) | (tested.reads() if tested else set())
+        levels = [statements.merged(level) for level in levels_of(made, at_end)]
         return Plan(levels, copies, tested, in_step)
 
     def _copy(self, value: Value) -> Code:
@@ -192,16 +70,16 @@ class Scheduler:
         code.result = _Expression(self, code).compute(item, np.arange(item.size))
         return Statement([item], code)
 
-    def _step(self, step: Step, in_step: bool) -> StepStatement:
+    def _step(self, step: values.Step, in_step: bool) -> StepStatement:
         copied = zip(keeping.copied_by(step), step.writes, strict=False)
         copies = [(home(x), self._copy(value)) for value, x in copied if x.size]
         plans, which = [], None
-        if isinstance(step, Loop):
+        if isinstance(step, values.Loop):
             in_step = in_step and step.rounds is not None
             if step.test:
                 plans.append(self._plan(step.test, test=step.going, in_step=False))
             plans.append(self._plan(step.inner, step.results, step.writes, in_step=in_step))
-        if isinstance(step, Choice):
+        if isinstance(step, values.Choice):
             which = self._copy(step.reads[0])
             for block, results in zip(step.branches, step.results, strict=True):
                 plans.append(self._plan(block, results, step.writes, in_step=False))
@@ -268,35 +146,3 @@ class _Expression:
     def _leaf(self, leaf: Leaf) -> int:
         self.into.leaves.append(leaf)
         return ~(len(self.into.leaves) - 1)
-
-
-def merged(level: Sequence[Any]) -> list[Any]:
-    """Returns a level's statements with small ones that compute alike made one."""
-    groups: dict[Any, list[Any]] = collections.defaultdict(list)
-    for statement in level:
-        alone = isinstance(statement, StepStatement) or statement.shared
-        alone = alone or statement.size > MERGED or bool(statement.code.tables)
-        groups[id(statement) if alone else _form(statement)].append(statement)
-    return [x[0] if len(x) == 1 else _one_of(x) for x in groups.values()]
-
-
-def _form(statement: Statement) -> Any:
-    """Returns what statements have to share to be made one."""
-    code = statement.code
-    kinds = tuple((leaf.kind, bool(leaf.sources)) for leaf in code.leaves)
-    kind = statement.writes[0].kind
-    return statement.fold, statement.terms, tuple(code.lines), kinds, code.result, kind
-
-
-def _one_of(statements: Sequence[Statement]) -> Statement:
-    leaves = []
-    for parts in zip(*(x.code.leaves for x in statements), strict=True):
-        firsts = np.cumsum([0, *(len(part.sources) for part in parts)])
-        which = [part.which + first for part, first in zip(parts, firsts, strict=False)]
-        sources = tuple(x for part in parts for x in part.sources)
-        index = np.concatenate([part.index for part in parts])
-        leaves.append(Leaf(parts[0].kind, sources, np.concatenate(which), index))
-    first = statements[0]
-    code = Code(first.code.lines, leaves, first.code.result)
-    writes = [x for statement in statements for x in statement.writes]
-    return Statement(writes, code, first.fold, first.terms)

@@ -6,26 +6,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from purerl.exact.kernel import indices, memory, operations
+from purerl.exact.kernel import memory, operations
+from purerl.exact.kernel.cells import TYPES, Cells, each
 from purerl.exact.kernel.lanes import LANES
 from purerl.exact.kernel.reading import Program
-from purerl.exact.kernel.schedule import (
-    Code,
-    Line,
-    Leaf,
-    Plan,
-    Scheduler,
-    Statement,
-    StepStatement,
-)
-from purerl.exact.kernel.values import Choice, Const, Fold, Linear, Loop, NoRuleError, Value, home
+from purerl.exact.kernel.schedule import Scheduler
+from purerl.exact.kernel.statements import Code, Plan, Statement, StepStatement
+from purerl.exact.kernel.values import Choice, Fold, Linear, Loop, NoRuleError, Value, home
 
 # What follows is of the fastest build on an H200 (lab/2026-11-29-one-kernel-on-a-cpu.md).
 LOCKSTEP = 4  # levels from one barrier of a block to the next: its warps share fetched code
 FEW_TERMS = 20  # a row of no more is written out, one of more is a loop
 AT_ONCE = 128  # results that lanes sum in one loop: each takes a register
 MOST_MEMORY = 1 << 16  # numbers: their places are kept in 16 bits
-TYPES = {"f": "float", "i": "int", "b": "int"}
 
 
 class Text(NamedTuple):
@@ -56,8 +49,9 @@ def written(program: Program) -> Text:
     lines = list(writer.program(program))
     some = (program.inputs, program.outputs)
     sizes = [[(x.size, x.kind) for x in values if x.size] for values in some]
-    tables = [f"TABLE unsigned short T[] = {{{_numbers(writer.tables.places)}}};",
-              f"TABLE unsigned int C_[] = {{{_numbers(writer.tables.constants, 'u')}}};"]  # fmt: skip
+    places, constants = writer.tables.places, writer.tables.constants
+    tables = [f"TABLE unsigned short T[] = {{{_numbers(places)}}};"]
+    tables += [f"TABLE unsigned int C_[] = {{{_numbers(constants, 'u')}}};"]
     body = "\n".join([f"#define MEMORY {placed.size}", "PRELUDE", *tables, *lines, ""])
     counts = placed.size, placed.live, writer.statements
     return Text(body, *counts, *(tuple(x) for x in sizes))
@@ -67,12 +61,12 @@ def _numbers(arrays: Sequence[np.ndarray], suffix: str = "") -> str:
     return ",".join(f"{x}{suffix}" for array in arrays for x in array) or "0"
 
 
-class _Writer:
-    """Writes one kernel: its text refers to memory and to tables by number."""
+class _Writer(Cells):
+    """Writes one kernel."""
 
     def __init__(self, scheduler: Scheduler, placed: memory.Memory):
-        self.scheduler, self.address = scheduler, placed.address
-        self.tables, self.statements = indices.Tables(), 0
+        super().__init__(placed.address)
+        self.scheduler, self.statements = scheduler, 0
 
     def program(self, program: Program) -> Iterator[str]:
         """Yields the kernel: inputs are copied to memory, and results to the caller's arrays."""
@@ -82,86 +76,20 @@ class _Writer:
         words += [f"{TYPES[x.kind]}* out{i}" for i, x in enumerate(outputs)]
         yield f"KERNEL(const int* environments, {', '.join(words)}) {{\nBEGIN"
         for number, value in enumerate(inputs):
-            to = self._memory(value.kind, f"{self.address[value]}+i")
-            yield f"{_each(value.size)} {to} = in{number}[e*{value.size}+i];"
+            to = self.memory(value.kind, f"{self.address[value]}+i")
+            yield f"{each(value.size)} {to} = in{number}[e*{value.size}+i];"
         lines = list(self._plan(self.scheduler.plan, copied=False))
         if self.scheduler.slots:
             slots = np.array(list(self.scheduler.slots), np.uint32).view(np.int32)
             at = self.tables.constant(slots, "i")
-            yield f"{_each(len(slots))} I[i] = (int)C_[{at}+i];"
+            yield f"{each(len(slots))} I[i] = (int)C_[{at}+i];"
         yield "SYNC;"
         yield from lines
-        names = {x: f"out{i}[e*{x.size}+i]" for i, x in enumerate(outputs)}
+        names: dict[Value, str] = {x: f"out{i}[e*{x.size}+i]" for i, x in enumerate(outputs)}
         yield "if (there) {"
-        for value, code in self.scheduler.plan.copies:
-            yield self._assign(names[value], value.size, code)
+        for target, code in self.scheduler.plan.copies:
+            yield self.assign(names[target], target.size, code)
         yield "}\nEND }"
-
-    # --- numbers of memory and of constants ---
-
-    def _memory(self, kind: str, place: str) -> str:
-        return f"{'P' if kind == 'f' else 'I'}[{place}]"
-
-    def _addresses(self, leaf: Leaf) -> np.ndarray:
-        base = np.array([self.address[x] for x in leaf.sources])
-        return base[leaf.which] + leaf.index
-
-    def _constant(self, numbers: np.ndarray, kind: str, place: str) -> str:
-        """Returns C for constants; `place` is C for which of them."""
-        first = numbers.flat[0]
-        if (numbers == first).all() or (numbers != numbers).all():
-            return _literal(first, kind)
-        at = f"{self.tables.constant(numbers, kind)}+{place}"
-        return f"C[{at}]" if kind == "f" else f"((int)C_[{at}])"
-
-    def _leaf(self, leaf: Leaf, number: str = "i") -> str:
-        """Returns C for a leaf [n] at a place."""
-        if not leaf.sources:
-            return self._constant(leaf.index, leaf.kind, number)
-        return self._memory(leaf.kind, indices.text(self.tables, self._addresses(leaf), number))
-
-    def _term(self, leaf: Leaf, term: int | None) -> str:
-        """Returns C for a leaf [rows, terms] at row i, and at a term or, of None, at term j."""
-        if term is not None:
-            return self._leaf(leaf._replace(which=leaf.which[:, term], index=leaf.index[:, term]))
-        rows, terms = leaf.index.shape
-        if not leaf.sources:
-            return self._constant(np.ascontiguousarray(leaf.index.T), leaf.kind, f"{rows}*j+i")
-        at = self._addresses(leaf)
-        first, along = at[:, 0], at[0] - at[0, 0]
-        if (at == first[:, None] + along).all():
-            first, along = first + along.min(), along - along.min()
-            place = f"{indices.text(self.tables, first)}+{indices.text(self.tables, along, 'j')}"
-        else:
-            place = indices.text(self.tables, np.ascontiguousarray(at.T).reshape(-1), f"{rows}*j+i")
-        return self._memory(leaf.kind, place)
-
-    def _code(self, code: Code, leaves: Sequence[str]) -> tuple[list[str], str]:
-        """Returns the lines that compute one number, given C for its leaves, and its name."""
-        lines = [f"{TYPES[x.kind]} l{i} = {text};"
-                 for i, (x, text) in enumerate(zip(code.leaves, leaves, strict=True))]  # fmt: skip
-        for number, line in enumerate(code.lines):
-            args = [_name(arg) for arg in line.args]
-            text = self._operation(code, line, args)
-            lines.append(f"{TYPES[line.kind]} t{number} = {text};")
-        return lines, _name(code.result)
-
-    def _operation(self, code: Code, line: Line, args: list[str]) -> str:
-        if line.op != "lookup":
-            return operations.text_of(line.op, line.kind, line.param, *args)
-        table = code.tables[line.param]
-        if isinstance(table, Const):
-            at = self.tables.constant(table.array, table.kind)
-            return f"C[{at}+{args[0]}]" if line.kind == "f" else f"((int)C_[{at}+{args[0]}])"
-        return self._memory(line.kind, f"{self.address[home(table)]}+{args[0]}")
-
-    def _assign(self, target: str, size: int, code: Code) -> str:
-        lines, result = self._code(code, [self._leaf(leaf) for leaf in code.leaves])
-        return f"{_each(size)} {{ {' '.join(lines)} {target} = {result}; }}"
-
-    def _copy(self, value: Value, code: Code) -> str:
-        target = self._memory(value.kind, f"{self.address[value]}+i")
-        return self._assign(target, value.size, code)
 
     # --- statements ---
 
@@ -176,19 +104,19 @@ class _Writer:
             for statement in plain:
                 if not statement.shared:
                     yield self._fold(statement) if statement.fold else self._map(statement)
-            for statement in level:
-                if isinstance(statement, StepStatement):
-                    yield from self._step(statement)
+            for step in level:
+                if isinstance(step, StepStatement):
+                    yield from self._step(step)
             yield "SYNC;"
             self.statements += len(level)
         if copied and plan.copies:
-            yield from (self._copy(value, code) for value, code in plan.copies)
+            yield from (self.copy(value, code) for value, code in plan.copies)
             yield "SYNC;"
 
     def _map(self, statement: Statement) -> str:
         first = statement.writes[0]
-        target = self._memory(first.kind, f"{self.address[first]}+i")
-        return self._assign(target, statement.size, statement.code)
+        target = self.memory(first.kind, f"{self.address[first]}+i")
+        return self.assign(target, statement.size, statement.code)
 
     def _fold(self, statement: Statement) -> str:
         """Each lane makes a row one number, from its first term to its last."""
@@ -197,15 +125,15 @@ class _Writer:
         if terms <= FEW_TERMS:
             body = [f"{TYPES[first.kind]} sum;"]
             for term in range(terms):
-                lines, result = self._code(code, [self._term(leaf, term) for leaf in code.leaves])
+                lines, result = self.code(code, [self.term(leaf, term) for leaf in code.leaves])
                 body.append(f"{{ {' '.join(lines)} sum = {join(result) if term else result}; }}")
         else:
-            lines, result = self._code(code, [self._term(leaf, None) for leaf in code.leaves])
+            lines, result = self.code(code, [self.term(leaf, None) for leaf in code.leaves])
             start = operations.neutral(statement.fold, first.kind)
             body = [f"{TYPES[first.kind]} sum = {start};", f"ROUNDS(j, {terms}) {{", *lines]
             body += [f"sum = {join(result)};", "}"]
-        target = self._memory(first.kind, f"{self.address[first]}+i")
-        return f"{_each(statement.size)} {{ {' '.join(body)} {target} = sum; }}"
+        target = self.memory(first.kind, f"{self.address[first]}+i")
+        return f"{each(statement.size)} {{ {' '.join(body)} {target} = sum; }}"
 
     def _shared(self, statements: list[Statement]) -> Iterator[str]:
         """The lanes share each row. Rows of equal length are in one loop, and read once."""
@@ -220,8 +148,7 @@ class _Writer:
                 text = operations.text_of(fold, kind, None, f"SUM({number})", result)
                 sums.append(f"SUM({number}) = {text};")
             lines = [f"auto {name} = {text};" for text, name in body.items()]
-            count = 1 << (len(some) - 1).bit_length() if len(some) < LANES else -(-len(some) // LANES) * LANES
-            neutral = operations.neutral(fold, kind)
+            count, neutral = _padded(len(some)), operations.neutral(fold, kind)
             yield f"{{ SUMS({TYPES[kind]}, {count}, {neutral})"
             yield f"EACH(i, {terms}) {{ {' '.join(lines + sums)} }}"
             to, also = (self.tables.place(x) for x in self._targets(some))
@@ -234,15 +161,15 @@ class _Writer:
         def name(text: str) -> str:
             return known.setdefault(text, f"v{len(known)}")
 
-        leaves = [leaf._replace(which=leaf.which[row], index=leaf.index[row])
-                  if leaf.sources else leaf._replace(index=leaf.index[row])
+        leaves = [leaf._replace(which=leaf.which[row], at=leaf.at[row])
+                  if leaf.sources else leaf._replace(at=leaf.at[row])
                   for leaf in code.leaves]  # fmt: skip
-        texts = [self._leaf(leaf) for leaf in leaves]
+        texts = [self.leaf(leaf) for leaf in leaves]
         names = [name(text) for text in texts]
         results: list[str] = []
         for line in code.lines:
             args = [names[~arg] if arg < 0 else results[arg] for arg in line.args]
-            results.append(name(self._operation(code, line, args)))
+            results.append(name(self.operation(code, line, args)))
         return names[~code.result] if code.result < 0 else results[code.result]
 
     def _targets(self, rows: Sequence[tuple[Statement, int]]) -> tuple[np.ndarray, np.ndarray]:
@@ -255,7 +182,7 @@ class _Writer:
     # --- steps ---
 
     def _step(self, statement: StepStatement) -> Iterator[str]:
-        yield from (self._copy(value, code) for value, code in statement.copies)
+        yield from (self.copy(value, code) for value, code in statement.copies)
         yield "SYNC;"
         step = statement.step
         if isinstance(step, Linear):
@@ -290,7 +217,7 @@ class _Writer:
 
     def _uniform(self, code: Code) -> str:
         """Returns C that sets `which` to one number, the same in all lanes: see UNIFORM."""
-        lines, result = self._code(code, [self._leaf(leaf, "0") for leaf in code.leaves])
+        lines, result = self.code(code, [self.leaf(leaf, "0") for leaf in code.leaves])
         return f"int which; {{ {' '.join(lines)} which = UNIFORM({result}); }}"
 
     def _linear(self, step: Linear) -> str:
@@ -325,18 +252,6 @@ def _mirrored(statement: Statement, row: int) -> int:
     return row % n * n + row // n if n else row
 
 
-def _each(size: int) -> str:
-    return f"EACH(i, {size})" if size > LANES else f"FEW(i, {size})"
-
-
-def _name(number: int) -> str:
-    return f"t{number}" if number >= 0 else f"l{~number}"
-
-
-def _literal(number: float, kind: str) -> str:
-    if kind != "f":
-        return str(int(number))
-    if number != number:
-        return "NAN"
-    return f"{float(number)!r}f" if np.isfinite(number) else "INFINITY" if number > 0 else "-INFINITY"
-
+def _padded(number: int) -> int:
+    """Returns how many results lanes sum: a power of 2, or a multiple of LANES; see `put`."""
+    return 1 << (number - 1).bit_length() if number < LANES else -(-number // LANES) * LANES

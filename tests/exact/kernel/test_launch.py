@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from purerl import exact
-from purerl.exact.kernel import compilers, launch
+from purerl.exact.kernel import compilers
 from tests.exact.kernel import needs_compiler
 
 
@@ -26,7 +26,10 @@ def kernel():
 def test_it_is_called_as_the_function_is(kernel):
     for run in (kernel, jax.jit(kernel)):
         found, wanted = run(*EXAMPLE), function(*EXAMPLE)
-        assert jax.tree.map(lambda x: (x.shape, x.dtype), found) == {"a": ((), np.float32), "b": ((2, 3), bool)}
+        assert jax.tree.map(lambda x: (x.shape, x.dtype), found) == {
+            "a": ((), np.float32),
+            "b": ((2, 3), bool),
+        }
         assert found["a"] == wanted["a"] and (found["b"] == wanted["b"]).all()
     with pytest.raises(ValueError, match="the kernel is for"):
         kernel(EXAMPLE[1], EXAMPLE[0])
@@ -45,7 +48,9 @@ def test_vmap_makes_one_call_of_any_batch(kernel):
 
 
 def batched(number):
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((number, *np.shape(x)), np.asarray(x).dtype), EXAMPLE)
+    return jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((number, *np.shape(x)), np.asarray(x).dtype), EXAMPLE
+    )
 
 
 def lowered(kernel, number):
@@ -116,14 +121,14 @@ def test_agreement_counts_what_is_off():
     assert not one.agrees and one.off == 1 and one.size == 6
     found[1, 0] = 3.3
     one = agreement(found, wanted)
-    assert one.error == pytest.approx(0.3 / np.sqrt(55)) and one.worst == pytest.approx(0.3 / np.sqrt(50))
+    assert one.error == pytest.approx(0.3 / np.sqrt(55)) and one.worst == pytest.approx(
+        0.3 / np.sqrt(50)
+    )
     assert not one.agrees
 
 
 def test_a_kernel_has_no_derivative(kernel):
-    with pytest.raises(NotImplementedError, match="ifferentiation rule for 'kernel' not implemented"):
+    with pytest.raises(
+        NotImplementedError, match="ifferentiation rule for 'kernel' not implemented"
+    ):
         jax.jvp(lambda y: kernel(EXAMPLE[0], y)["a"], (jnp.ones(4),), (jnp.ones(4),))
-
-
-def test_the_ways_to_launch_have_names():
-    assert launch.TARGETS == ("xla", "triton")

@@ -89,10 +89,14 @@ def start(physics, changed, seed=0):
     rng, model = np.random.default_rng(seed), physics.model
     qpos = np.tile(model.qpos0, (N, 1)).astype(np.float32)
     qvel = (0.3 * rng.normal(size=(N, model.nv))).astype(np.float32)
-    states = [physics.init(jnp.asarray(p), jnp.asarray(v))[0] for p, v in zip(qpos, qvel, strict=True)]
+    states = [
+        physics.init(jnp.asarray(p), jnp.asarray(v))[0] for p, v in zip(qpos, qvel, strict=True)
+    ]
     state = jax.tree.map(lambda *x: np.stack(x), *states)
     fields = {n: np.asarray(getattr(model, n), np.float32) for n in changed}
-    changes = {n: x * rng.uniform(0.8, 1.2, (N, *x.shape)).astype(np.float32) for n, x in fields.items()}
+    changes = {
+        n: x * rng.uniform(0.8, 1.2, (N, *x.shape)).astype(np.float32) for n, x in fields.items()
+    }
     return state, np.zeros((N, model.nu), np.float32), changes
 
 
@@ -106,14 +110,19 @@ def compared(physics, changed, control_steps, kernel=None):
     for _ in range(control_steps):
         ctrl = rng.uniform(-1, 1, ctrl.shape).astype(np.float32)
         args = state, ctrl, changes
-        flat = [np.concatenate(rows(*map(np.asarray, jax.tree.leaves(f(*args)))), 1) for f in (by_kernel, by_xla)]
+        flat = [
+            np.concatenate(rows(*map(np.asarray, jax.tree.leaves(f(*args)))), 1)
+            for f in (by_kernel, by_xla)
+        ]
         found.append(compiling.agreement(*flat))
         state = jax.tree.map(np.asarray, by_xla(*args)[0])
     return kernel, found, args
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", ["pendulum", *(pytest.param(n, marks=pytest.mark.slow) for n in ("arm", "heap"))])
+@pytest.mark.parametrize(
+    "name", ["pendulum", *(pytest.param(n, marks=pytest.mark.slow) for n in ("arm", "heap"))]
+)
 def test_a_control_step_is_xlas(name, tmp_path):
     xml, readings, substeps, changed = MODELS[name]
     physics = Physics(mujoco.MjModel.from_xml_string(xml), readings, substeps, "jax")
@@ -121,7 +130,9 @@ def test_a_control_step_is_xlas(name, tmp_path):
     assert all(x.agrees and x.error < 1e-4 for x in found), found
     arrays = rows(*map(np.asarray, jax.tree.leaves(args)))
     one, warps = by_one_lane(kernel.text, *arrays), by_warps(kernel.text, *arrays, folder=tmp_path)
-    assert all((x.view(np.int32) == y.view(np.int32)).all() for x, y in zip(one, warps, strict=True))
+    assert all(
+        (x.view(np.int32) == y.view(np.int32)).all() for x, y in zip(one, warps, strict=True)
+    )
 
 
 @needs_compiler

@@ -26,7 +26,12 @@ def by_lanes(row):
 
 
 def sums(table):
-    return table.sum(1), jnp.concatenate([table, table]).sum(1), table[:, :31].sum(1), table[:, :4].sum(1)
+    return (
+        table.sum(1),
+        jnp.concatenate([table, table]).sum(1),
+        table[:, :31].sum(1),
+        table[:, :4].sum(1),
+    )
 
 
 @needs_compiler

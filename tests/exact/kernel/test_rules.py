@@ -50,19 +50,36 @@ def solves(a, b):
         cho(jax.scipy.linalg.cho_factor(square, lower=True), b),
         solve(left_side=True, lower=True, transpose_a=True),
         lax.linalg.triangular_solve(jnp.triu(a) + SQUARE, jnp.stack([b, 2 * b], 1), left_side=True),
-        lax.linalg.triangular_solve(jnp.asarray(SQUARE + 1.0), b[:, None], left_side=True, lower=True),
+        lax.linalg.triangular_solve(
+            jnp.asarray(SQUARE + 1.0), b[:, None], left_side=True, lower=True
+        ),
     )
 
 
 def newton(x):
     """Ends after other numbers of rounds for each environment."""
     going = lambda c: (c[1] ** 2 - x[0] ** 2 > 1e-3).any() & (c[0] < 20)  # noqa: E731
-    return lax.while_loop(going, lambda c: (c[0] + 1, (c[1] + x[0] ** 2 / c[1]) / 2), (0, 9 + x[0] ** 2))
+    return lax.while_loop(
+        going, lambda c: (c[0] + 1, (c[1] + x[0] ** 2 / c[1]) / 2), (0, 9 + x[0] ** 2)
+    )
 
 
 def swapped(x):
-    """A carry whose parts change places, and one that stays."""
-    return lax.fori_loop(0, 5, lambda i, c: (c[1] + i, c[0] * 0.5, c[2]), (x, x + 1, 2 * x))
+    """A carry whose parts change places or are turned round, and one that stays."""
+    changed = lax.fori_loop(0, 5, lambda i, c: (c[1] + i, c[0] * 0.5, c[2]), (x, x + 1, 2 * x))
+    return changed, lax.fori_loop(0, 3, lambda i, c: (c[1], c[0], c[2][::-1]), (x, x + 1, 2 * x))
+
+
+def reused(x):
+    """Memory of what each round reads, or carries unchanged, is not taken in between."""
+    y = jnp.sin(x)
+
+    def body(_, c):
+        a = jnp.sort(c[0] + y)
+        b = jnp.sort(a[::-1] * a)
+        return jnp.sort(b + a.sum()) * 0.1, c[1]
+
+    return lax.fori_loop(0, 3, body, (x, jnp.cos(x)))
 
 
 def in_rounds(x):
@@ -79,11 +96,20 @@ def nested(x):
 
 def branches(x, i):
     two = lax.cond(x[0] > 0, lambda: jnp.sin(x), lambda: jnp.stack([x.sum()] * 4))
-    return two, lax.switch(i[0], [lambda: x, lambda: 2 * x, lambda: x[::-1]]), lax.switch(1, [lambda: x] * 2)
+    return (
+        two,
+        lax.switch(i[0], [lambda: x, lambda: 2 * x, lambda: x[::-1]]),
+        lax.switch(1, [lambda: x] * 2),
+    )
 
 
 def moved(x):
-    parts = [x.T, x[::-1, 1:3], x[None, ..., None], lax.pad(x, jnp.float32(7), ((1, 2, 0), (0, -1, 0)))]
+    parts = [
+        x.T,
+        x[::-1, 1:3],
+        x[None, ..., None],
+        lax.pad(x, jnp.float32(7), ((1, 2, 0), (0, -1, 0))),
+    ]
     parts += [jnp.tile(x, (2, 1)), jnp.concatenate([x, 0 * x[:1], x[:2]]), jnp.stack([x, x + 1], 1)]
     parts += [*jnp.split(x, 3), jnp.broadcast_to(x[0], (3, 4)), x.reshape(2, 6), x[::2]]
     return parts
@@ -100,53 +126,124 @@ def looked_up(x, i):
     parts = [x[i], table[i, 1], x.reshape(2, 5)[i % 2], jnp.take(x, i, mode="clip"), x[:3][i]]
     parts += [jnp.take(x, 2 * i, mode="fill"), jnp.take(x, i + 9, mode="fill", fill_value=4.0)]
     parts += [lax.dynamic_slice(x, (i[0],), (3,)), lax.dynamic_slice(table, (i[1], i[2]), (2, 2))]
-    parts += [lax.dynamic_update_slice(x, x[:2] + 9, (i[0],)), jax.vmap(lambda r, k: r[k])(table, i)]
+    parts += [
+        lax.dynamic_update_slice(x, x[:2] + 9, (i[0],)),
+        jax.vmap(lambda r, k: r[k])(table, i),
+    ]
     return [*parts, x[INDEX], x.reshape(5, 2)[INDEX, 1]]
 
 
 def ordered(x, i):
     pairs = lax.sort((i, x), num_keys=2)
-    return [jnp.sort(x), jnp.argsort(x), jnp.sort(x.reshape(2, 5), 0), *lax.top_k(x, 3), *pairs, jnp.argsort(i)]
+    return [
+        jnp.sort(x),
+        jnp.argsort(x),
+        jnp.sort(x.reshape(2, 5), 0),
+        *lax.top_k(x, 3),
+        *pairs,
+        jnp.argsort(i),
+    ]
 
 
 def sums(x):
     y = x.reshape(40, 10)
     parts = [y.sum(0), y.sum(1), y.sum(), (y * y).sum(0), y.max(0), y.min(), y.prod(1), x[:3].sum()]
     parts += [y.argmax(0), y.argmin(1), (y > 0).all(0), (y > 1.5).any(1), y.mean((0, 1))]
-    parts += [jnp.cumsum(x[:7]), lax.cumprod(x[:6].reshape(2, 3), 1), lax.cummax(x[:7], reverse=True)]
+    parts += [
+        jnp.cumsum(x[:7]),
+        lax.cumprod(x[:6].reshape(2, 3), 1),
+        lax.cummax(x[:7], reverse=True),
+    ]
     return [*parts, (y[:, 0] > 0).sum(), y[:0].sum(0), y[:, :5].max(1)]
 
 
 def products(x, y):
     hessian = jnp.einsum("ki,k,kj->ij", y, x[:40] ** 2, y)
     square = jnp.einsum("ki,kj->ij", y, jnp.sin(y))  # not symmetric
-    parts = [y @ y.T, y.T @ y, hessian, square, jnp.einsum("bij,bj->bi", y.reshape(4, 10, 10), y[:4])]
+    parts = [
+        y @ y.T,
+        y.T @ y,
+        hessian,
+        square,
+        jnp.einsum("bij,bj->bi", y.reshape(4, 10, 10), y[:4]),
+    ]
     return [*parts, jnp.dot(x[:10], x[10:20]), jnp.cross(x[:3], x[3:6]), y @ x[:10]]
 
 
 def numbers(x, y):
     """One function that has one result for each elementwise operation."""
     parts = [x + y, x - y, x * y, x / y, -x, abs(x), jnp.maximum(x, y), jnp.minimum(x, y)]
-    parts += [jnp.sign(x), jnp.floor(x), jnp.ceil(x), jnp.round(x), x**2, x**3, x**-2, jnp.square(x)]
+    parts += [
+        jnp.sign(x),
+        jnp.floor(x),
+        jnp.ceil(x),
+        jnp.round(x),
+        x**2,
+        x**3,
+        x**-2,
+        jnp.square(x),
+    ]
     parts += [f(x) for f in (jnp.sin, jnp.cos, jnp.tan, jnp.arctan, jnp.sinh, jnp.cosh, jnp.tanh)]
     parts += [f(x) for f in (jnp.exp, jnp.exp2, jnp.expm1, jax.nn.sigmoid, jnp.cbrt)]
     parts += [f(abs(x)) for f in (jnp.sqrt, lax.rsqrt, jnp.log, jnp.log1p)]
     parts += [f(jnp.tanh(x)) for f in (jnp.arcsin, jnp.arccos)]
-    parts += [jnp.arctan2(x, y), abs(x) ** y, lax.rem(x, y), x < y, x <= y, x > y, x >= y, x == y, x != y]
+    parts += [
+        jnp.arctan2(x, y),
+        abs(x) ** y,
+        lax.rem(x, y),
+        x < y,
+        x <= y,
+        x > y,
+        x >= y,
+        x == y,
+        x != y,
+    ]
     parts += [jnp.isfinite(x / (y - y)), jnp.where(x > 0, x, y), jnp.clip(x, -0.5, 0.5)]
-    return [*parts, lax.select_n(jnp.int32(x > 0) + jnp.int32(x > 1), x, y, x + y), x.astype(jnp.int32)]
+    return [
+        *parts,
+        lax.select_n(jnp.int32(x > 0) + jnp.int32(x > 1), x, y, x + y),
+        x.astype(jnp.int32),
+    ]
 
 
 def integers(i, j):
     a, b = i > 0, j > 0
-    parts = [a & b, a | b, a ^ b, ~a, i & j, i | j, ~i, i * j, i - j, lax.rem(i, j), lax.div(i, jnp.int32(3))]
-    return [*parts, abs(i), jnp.sign(i), i.astype(jnp.float32), a.astype(jnp.int32), i.max(), i.sum()]
+    parts = [
+        a & b,
+        a | b,
+        a ^ b,
+        ~a,
+        i & j,
+        i | j,
+        ~i,
+        i * j,
+        i - j,
+        lax.rem(i, j),
+        lax.div(i, jnp.int32(3)),
+    ]
+    return [
+        *parts,
+        abs(i),
+        jnp.sign(i),
+        i.astype(jnp.float32),
+        a.astype(jnp.int32),
+        i.max(),
+        i.sum(),
+    ]
 
 
 def known(x):
     """Nothing but constants, in part: computed before the kernel runs."""
     a = jnp.arange(6.0)
-    parts = [jnp.sin(a), a @ a, jnp.sort(a[::-1]), a**0.5, (a > 2).sum(), a / 3, 7 // jnp.arange(1, 4)]
+    parts = [
+        jnp.sin(a),
+        a @ a,
+        jnp.sort(a[::-1]),
+        a**0.5,
+        (a > 2).sum(),
+        a / 3,
+        7 // jnp.arange(1, 4),
+    ]
     return [*parts, x * 0, x * 1 + 0, jnp.where(a > 2, x[:6], x[1:7]), jnp.zeros(0), x[:0] * 2]
 
 
@@ -175,13 +272,17 @@ FUNCTIONS = {
     "known": (known, real(7)),
     "looked_up": (looked_up, real(10), whole(5, least=0, most=5)),
     "moved": (moved, real(3, 4)),
-    "nan_first": (lambda x: (x.argmax(), x.max(), jnp.sort(x), x.argmin(), lax.top_k(x, 2)), with_nan(7)),
+    "nan_first": (
+        lambda x: (x.argmax(), x.max(), jnp.sort(x), x.argmin(), lax.top_k(x, 2)),
+        with_nan(7),
+    ),
     "nested": (nested, real(4)),
-    "newton": (newton, real(2)),
+    "newton": (newton, real(6)),
     "numbers": (numbers, real(40), real(40, seed=1)),
     "ordered": (ordered, real(10), whole(10)),
     "products": (products, real(40), real(40, 10)),
     "put": (put, real(4), real(4, seed=1)),
+    "reused": (reused, real(9)),
     "solves": (solves, real(4, 4), real(4)),
     "sums": (sums, real(400)),
     "swapped": (swapped, real(4)),
@@ -213,9 +314,15 @@ def results(kernel):
 def test_a_kernel_computes_what_jax_does(results, name):
     found, wanted = (x[name] for x in results)
     assert jax.tree.structure(found) == jax.tree.structure(wanted)
-    for number, (x, y) in enumerate(zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True)):
+    for number, (x, y) in enumerate(
+        zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True)
+    ):
         assert x.shape == y.shape and x.dtype == y.dtype, number
-        close = np.allclose(x, y, INEXACT, INEXACT, equal_nan=True) if x.dtype.kind == "f" else (x == y).all()
+        close = (
+            np.allclose(x, y, INEXACT, INEXACT, equal_nan=True)
+            if x.dtype.kind == "f"
+            else (x == y).all()
+        )
         assert close, f"result {number}:\n{x}\nfor\n{y}"
 
 
@@ -240,16 +347,23 @@ def test_what_has_no_rule_is_named_with_its_line():
     example = np.ones(5, np.float32), np.zeros(2, np.int32)
     found = exact.kernel_missing(unknown, *example)
     assert {x.primitive for x in found} >= {"scatter", "population_count"}
-    assert all("test_rules.py" in x.source for x in found if x.primitive in ("scatter", "population_count"))
+    assert all(
+        "test_rules.py" in x.source for x in found if x.primitive in ("scatter", "population_count")
+    )
     (scatter,) = [x for x in found if x.primitive == "scatter"]
     assert "known only while running" in scatter.why
-    with pytest.raises(compiling.NoRuleError, match=r"No kernel computes scatter of places .* at .*test_rules.py:\d+"):
+    with pytest.raises(
+        compiling.NoRuleError,
+        match=r"No kernel computes scatter of places .* at .*test_rules.py:\d+",
+    ):
         exact.compile_kernel(unknown, *example)
     assert not exact.kernel_missing(sums, np.ones(400, np.float32))
 
 
 def test_what_a_kernel_cannot_hold_is_refused():
-    with pytest.raises(compiling.NoRuleError, match="memory for 90,001 numbers .* leave this step to XLA"):
+    with pytest.raises(
+        compiling.NoRuleError, match="memory for 90,001 numbers .* leave this step to XLA"
+    ):
         exact.compile_kernel(jnp.sum, np.ones(90_000, np.float32))
     with pytest.raises(compiling.NoRuleError, match="uint8"):
         exact.compile_kernel(lambda x: x.astype(jnp.uint8), np.ones(3, np.float32))
