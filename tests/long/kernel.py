@@ -12,8 +12,9 @@ printed, and the next one is tried where that makes sense. In this order:
   bits       one digest in two processes, and of 1,024 environments alone and among 4,096
   rate       control steps/s of physics alone beside engine `jax`, in turns
 
-A launch is tried in each way there is ("xla", "triton"), and the first that works is taken for the
-rest. Exit code 0: go, all is right; 1: no-go, and what failed stands in the table.
+A launch is tried as it is, by XLA's own call ("xla"), and by that of Pallas' Triton ("triton"); the
+first that works is taken for the rest. If that is "triton", `launch.by_xla` has to become what
+`by_triton` is here. Exit code 0: go, all is right; 1: no-go, and what failed stands in the table.
 """
 
 import argparse
@@ -22,6 +23,7 @@ import subprocess
 import sys
 import time
 import traceback
+import zlib
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -29,17 +31,19 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.interpreters import mlir
 
 from purerl import exact
 from purerl.exact.kernel import compilers, compiling, launch
+from purerl.exact.kernel.text import Text
 from purerl.experiment import command_line
 from purerl.experiment.loading import find_source
 from purerl.physics.engine_mjx import mjx_defaults
 
 NUMBERS = (1024, 4096, 8192)  # environments whose rate is measured
+BESIDE = 4096  # at which engine `jax`, which takes long to compile, is measured, too
 REACHED = 11  # random control steps before states are compared: the ant has fallen on its feet
-COMPARED = 256  # environments
-ROUNDS = 20  # control steps of one program whose time is measured
+ROUNDS = 20  # control steps whose time is measured
 TURNS = 5
 table: list[tuple[str, str, str]] = []  # step, "ok" or "FAILED", what was found
 
@@ -57,6 +61,31 @@ def tried(name: str, job: Callable[[], Any], say: Callable[[Any], str] = str) ->
     table.append(row)
     print(f"{time.perf_counter() - begin:7.1f} s  {'  '.join(row)}", flush=True)
     return found
+
+
+def by_triton(ptx: str, text: Text, blocks: int, warps: int) -> tuple[str, dict[str, Any]]:
+    """As `launch.by_xla`: the call of Pallas' Triton; jaxlib compiles the PTX and starts it.
+
+    It adds pointers to scratch memory after the arrays; a kernel that declares none reads none.
+    """
+    from jax._src.lib import gpu_triton  # JAX has no public way
+
+    size, chip = 4 * text.memory * warps, launch.capability()
+    kernel = gpu_triton.TritonKernel("kernel", warps, 1, size, ptx, "", chip)
+    arrays = 1 + len(text.inputs) + len(text.outputs)
+    parameters = [gpu_triton.create_array_parameter(0, 4)] * arrays
+    call = gpu_triton.TritonKernelCall(kernel, blocks, 1, 1, parameters)
+    words = {"name": b"kernel", "opaque": zlib.compress(call.to_proto("kernel", b""))}
+    return "triton_kernel_call_ffi", {n: mlir.ir.StringAttr.get(x) for n, x in words.items()}
+
+
+WAYS = {"xla": launch.by_xla, "triton": by_triton}
+
+
+def take(way: str) -> None:
+    """Launches all kernels in a way from now on."""
+    launch.by_xla = WAYS[way]
+    jax.clear_caches()
 
 
 class Subject(NamedTuple):
@@ -95,22 +124,25 @@ def repeated(of: Subject, number: int) -> Any:
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (number, *x.shape)), of.state)
 
 
-def stepped(step: Callable, rounds: int) -> Callable:
-    """Returns a program of control steps under one control: (state, ctrl) -> state."""
-
-    def run(state: Any, ctrl: Any) -> Any:
-        each = jax.vmap(lambda s, c: step(s, c, {})[0])
-        return jax.lax.scan(lambda s, _: (each(s, ctrl), None), state, None, rounds)[0]
-
-    return jax.jit(run)
+def stepped(step: Callable) -> Callable:
+    """Returns a program of one control step: (states, controls) -> states."""
+    return jax.jit(jax.vmap(lambda state, ctrl: step(state, ctrl, {})[0]))
 
 
-def rules(target: str) -> str:
+def repeat(program: Callable, state: Any, ctrl: Any) -> Any:
+    """Makes some control steps under one control."""
+    for _ in range(ROUNDS):
+        state = program(state, ctrl)
+    return jax.block_until_ready(state)
+
+
+def rules(way: str) -> str:
     """Compares the kernel of all rules with XLA."""
     from tests.exact.kernel import test_rules as of
 
+    take(way)
     kernel = exact.compile_kernel(of.all_of_them, jax.tree.map(lambda x: x[0], of.INPUTS))
-    found = jax.jit(jax.vmap(partial(kernel, target=target)))(of.INPUTS)
+    found = jax.jit(jax.vmap(kernel))(of.INPUTS)
     wanted = jax.jit(jax.vmap(of.all_of_them))(of.INPUTS)
     wrong = []
     for name in of.FUNCTIONS:
@@ -119,17 +151,17 @@ def rules(target: str) -> str:
         wrong += [f"{name}[{i}]" for i, good in enumerate(near) if not good]
     if wrong:
         raise ValueError(f"{len(wrong)} results are wrong: {', '.join(wrong[:20])}")
-    return f"{len(of.FUNCTIONS)} functions, launched by {target}"
+    return f"{len(of.FUNCTIONS)} functions, launched by {way}"
 
 
-def agreement(of: Subject, kernel: Callable) -> compiling.Agreement:
+def agreement(of: Subject, kernel: Callable, by_xla: Callable) -> compiling.Agreement:
     """Compares a control step with XLA's, on states that XLA has reached."""
-    state, by_xla = repeated(of, COMPARED), stepped(of.exact_step, 1)
+    state = repeated(of, BESIDE)
     for seed in range(REACHED):
-        state = by_xla(state, controls(of, COMPARED, seed))
-    ctrl = controls(of, COMPARED, REACHED)
-    results = [run(state, ctrl) for run in (stepped(kernel, 1), by_xla)]
-    flat = [[np.reshape(x, (COMPARED, -1)) for x in jax.tree.leaves(y)] for y in results]
+        state = by_xla(state, controls(of, BESIDE, seed))
+    ctrl = controls(of, BESIDE, REACHED)
+    results = [run(state, ctrl) for run in (stepped(kernel), by_xla)]
+    flat = [[np.reshape(x, (BESIDE, -1)) for x in jax.tree.leaves(y)] for y in results]
     found = compiling.agreement(*(np.concatenate(x, 1) for x in flat))
     if not found.agrees:
         raise ValueError(f"too far from XLA: {found}")
@@ -138,7 +170,7 @@ def agreement(of: Subject, kernel: Callable) -> compiling.Agreement:
 
 def digest(of: Subject, kernel: Callable, number: int, first: int) -> str:
     """Returns the digest of the first environments' states after some control steps."""
-    state = stepped(kernel, ROUNDS)(repeated(of, number), controls(of, number, 0))
+    state = repeat(stepped(kernel), repeated(of, number), controls(of, number, 0))
     rows = [np.asarray(x)[:first].tobytes() for x in jax.tree.leaves(state)]
     return hashlib.sha256(b"".join(rows)).hexdigest()[:16]
 
@@ -156,21 +188,21 @@ def digests(of: Subject, kernel: Callable, words: list[str]) -> str:
     return f"{found['again']} in all of {', '.join(found)}"
 
 
-def rates(of: Subject, kernel: Callable, number: int) -> str:
-    """Returns the median rates of the kernel and of engine `jax`, in turns [control steps/s]."""
+def rate(of: Subject, programs: list[Callable], number: int) -> str:
+    """Returns the median rates of programs, in turns [control steps/s]."""
     state, ctrl = repeated(of, number), controls(of, number, 0)
-    programs = [stepped(step, ROUNDS) for step in (kernel, of.exact_step)]
-    state = jax.block_until_ready(programs[0](state, ctrl))
-    jax.block_until_ready(programs[1](state, ctrl))
-    seconds: list[list[float]] = [[], []]
+    state = [repeat(program, state, ctrl) for program in programs][0]
+    seconds: list[list[float]] = [[] for _ in programs]
     for _ in range(TURNS):
         for program, taken in zip(programs, seconds, strict=True):
             begin = time.perf_counter()
-            jax.block_until_ready(program(state, ctrl))
+            repeat(program, state, ctrl)
             taken.append(time.perf_counter() - begin)
-    ours, theirs = (number * ROUNDS / float(np.median(taken)) for taken in seconds)
+    found = [number * ROUNDS / float(np.median(taken)) for taken in seconds]
     spread = [f"{max(x) / min(x):.2f}" for x in seconds]
-    return f"{ours:,.0f} and {theirs:,.0f}: {ours / theirs:.2f} times (spread {', '.join(spread)})"
+    said = " and ".join(f"{x:,.0f}" for x in found)
+    ratio = f": {found[0] / found[1]:.2f} times" if len(found) > 1 else ""
+    return f"{said}{ratio} (spread {', '.join(spread)})"
 
 
 def main() -> int:
@@ -181,9 +213,7 @@ def main() -> int:
     )
     parser.add_argument("--experiment", default="ant_run")
     parser.add_argument("--words", nargs=argparse.REMAINDER, default=[], help="of its command line")
-    parser.add_argument(
-        "--target", choices=launch.TARGETS, help="how to launch; else all are tried"
-    )
+    parser.add_argument("--way", choices=WAYS, help="how to launch; else all are tried")
     parser.add_argument("--only-digest", action="store_true", help=argparse.SUPPRESS)
     words = [x for x in sys.argv[1:] if x != "--only-digest"]
     options = parser.parse_args(words)
@@ -193,41 +223,41 @@ def main() -> int:
     of = subject(options.experiment, options.words)
     make = lambda: exact.compile_kernel(of.step, of.state, of.ctrl, {})  # noqa: E731
     if "--only-digest" in sys.argv:
-        kernel = partial(make(), target=options.target or launch.TARGETS[0])
-        print(digest(of, kernel, NUMBERS[1], NUMBERS[0]))
+        take(options.way or "xla")
+        print(digest(of, make(), NUMBERS[1], NUMBERS[0]))
         return 0
     print(jax.devices()[0].device_kind, "jax", jax.__version__, flush=True)
-    ways = [options.target] if options.target else launch.TARGETS
-    working = [way for way in ways if tried(f"rules, {way}", partial(rules, way))]
+    ways = [options.way] if options.way else list(WAYS)
+    way = next((way for way in ways if tried(f"rules, {way}", partial(rules, way))), ways[0])
+    take(way)
     made = tried("step", make, describe)
-    if made and tried(
-        "ptx",
-        lambda: compilers.for_gpu(made.text, launch.capability()),
-        lambda x: f"{len(x):,} bytes",
-    ):
-        way = (working or ways)[0]
-        kernel = partial(made, target=way)
-        tried("agreement", partial(agreement, of, kernel))
-        more = [] if options.target else ["--target", way]
-        tried("bits", partial(digests, of, kernel, [*more, *words]))
+    if made and tried("ptx", partial(compilers.for_gpu, made.text, launch.capability()), size_of):
+        by_xla = stepped(of.exact_step)
+        tried("agreement", partial(agreement, of, made, by_xla))
+        more = [] if options.way else ["--way", way]
+        tried("bits", partial(digests, of, made, [*more, *words]))
         for number in NUMBERS:
-            tried(f"rate of {number:,}", partial(rates, of, kernel, number))
+            programs = [stepped(made)] + [by_xla] * (number == BESIDE)
+            tried(f"rate of {number:,}", partial(rate, of, programs, number))
     print(f"\n{'step':18} {'':7} found")
     for name, how, what in table:
         print(f"{name:18} {how:7} {what}")
-    needed = {name: how for name, how, _ in table if not name.startswith("rules")}
-    go = working and {"step", "ptx", "agreement", "bits"} <= {
-        n for n, how in needed.items() if how == "ok"
-    }
+    fine = {name for name, how, _ in table if how == "ok"}
+    go = {f"rules, {way}", "step", "ptx", "agreement", "bits"} <= fine
     print("go: it launches, agrees and repeats itself" if go else "no-go")
     return 0 if go else 1
+
+
+def size_of(ptx: str) -> str:
+    """Says how long PTX is."""
+    return f"{len(ptx):,} bytes"
 
 
 def describe(kernel: compiling.Kernel) -> str:
     """Says what a kernel needs."""
     text, block = kernel.text, compilers.environments_of(kernel.text, launch.capability())
-    return (f"{text.statements} statements, {len(text.body):,} characters, {4 * text.memory:,} bytes "
-            f"an environment, {block} of them a block")  # fmt: skip
+    said = f"{text.statements} statements, {len(text.body):,} characters, "
+    return f"{said}{4 * text.memory:,} bytes an environment, {block} of them a block"
 
 
 if __name__ == "__main__":

@@ -17,7 +17,9 @@ N = 4  # environments
 
 PENDULUM = """
 <mujoco>
-  <worldbody><body><joint name="j" axis="0 1 0" damping="0.1"/><geom size="0.1" pos="0 0 -0.5"/></body></worldbody>
+  <worldbody>
+    <body><joint name="j" axis="0 1 0" damping="0.1"/><geom size="0.1" pos="0 0 -0.5"/></body>
+  </worldbody>
   <actuator><motor joint="j"/></actuator>
   <sensor><jointpos joint="j"/></sensor>
 </mujoco>
@@ -35,32 +37,44 @@ ARM = """
         <joint name="b" axis="0 1 0" stiffness="2" damping="0.2" armature="0.01"/>
         <joint name="c" axis="0 0 1"/>
         <geom type="capsule" size="0.04" fromto="0 0 0 0.3 0 0"/>
-        <body name="hand" pos="0.3 0 0"><joint name="d" axis="0 1 0"/><geom size="0.05"/><site name="tip" size="0.06"/></body>
+        <body name="hand" pos="0.3 0 0">
+          <joint name="d" axis="0 1 0"/><geom size="0.05"/><site name="tip" size="0.06"/>
+        </body>
       </body>
     </body>
     <body name="other" pos="0.4 0 0.12"><freejoint/><geom name="ball" size="0.1"/></body>
   </worldbody>
   <tendon>
-    <fixed name="t" limited="true" range="-0.2 0.2" frictionloss="0.05" stiffness="1"><joint joint="b" coef="1"/><joint joint="d" coef="-0.5"/></fixed>
+    <fixed name="t" limited="true" range="-0.2 0.2" frictionloss="0.05" stiffness="1">
+      <joint joint="b" coef="1"/><joint joint="d" coef="-0.5"/>
+    </fixed>
   </tendon>
-  <equality><joint joint1="c" joint2="d" polycoef="0 0.5 0 0 0"/><connect body1="hand" body2="other" anchor="0 0 0" active="true"/></equality>
+  <equality>
+    <joint joint1="c" joint2="d" polycoef="0 0.5 0 0 0"/>
+    <connect body1="hand" body2="other" anchor="0 0 0"/>
+  </equality>
   <actuator>
-    <position joint="a" kp="5"/><muscle joint="b" lengthrange="-1 1"/><velocity joint="d" kv="0.2"/>
+    <position joint="a" kp="5"/><muscle joint="b" lengthrange="-1 1"/>
+    <velocity name="v" joint="d" kv="0.2"/>
   </actuator>
   <sensor>
-    <accelerometer site="tip"/><gyro site="tip"/><touch site="tip"/><subtreecom body="fixed"/><framepos objtype="body" objname="hand"/>
-    <tendonpos tendon="t"/><actuatorfrc actuator="2"/>
+    <accelerometer site="tip"/><gyro site="tip"/><touch site="tip"/><subtreecom body="fixed"/>
+    <framepos objtype="body" objname="hand"/><tendonpos tendon="t"/><actuatorfrc actuator="v"/>
   </sensor>
 </mujoco>
-""".replace('actuator="2"', 'actuator="v"').replace("<velocity", '<velocity name="v"')
-# Elliptic cones with all kinds of friction, boxes and capsules that lie on each other, a mocap body.
+"""
+# Elliptic cones with all kinds of friction, a capsule that lies on a box, a mocap body.
 HEAP = """
 <mujoco>
   <option cone="elliptic" iterations="4" ls_iterations="6" impratio="2"/>
   <worldbody>
     <geom type="plane" size="2 2 1"/>
-    <body name="box" pos="0 0 0.1" quat="1 0.02 0.03 0.1"><freejoint/><geom type="box" size="0.1 0.1 0.1" condim="4"/></body>
-    <body pos="0.02 0 0.249" quat="1 0.1 1 0"><freejoint/><geom type="capsule" size="0.05 0.1" condim="6"/></body>
+    <body name="box" pos="0 0 0.1" quat="1 0.02 0.03 0.1">
+      <freejoint/><geom type="box" size="0.1 0.1 0.1" condim="4"/>
+    </body>
+    <body pos="0.02 0 0.249" quat="1 0.1 1 0">
+      <freejoint/><geom type="capsule" size="0.05 0.1" condim="6"/>
+    </body>
     <body name="hand" mocap="true" pos="0.3 0 0.3"/>
     <body name="held" pos="0.3 0 0.3"><freejoint/><geom type="sphere" size="0.05"/></body>
   </worldbody>
@@ -75,7 +89,7 @@ MODELS = {
 
 
 def stepping(physics):
-    """Returns the engine's own control step: substeps and readings, fields of the model as inputs."""
+    """Returns the engine's own control step, whose changed fields of the model are inputs."""
 
     def step(state, ctrl, changes):
         with mjx_defaults():
@@ -100,8 +114,8 @@ def start(physics, changed, seed=0):
     return state, np.zeros((N, model.nu), np.float32), changes
 
 
-def compared(physics, changed, control_steps, kernel=None):
-    """Returns the kernel, its agreement with XLA after each control step, and the last arguments."""
+def compared(physics, changed, control_steps):
+    """Returns the kernel, its agreement with XLA at each control step, and the last arguments."""
     step, (state, ctrl, changes) = stepping(physics), start(physics, changed)
     one = jax.tree.map(lambda x: x[0], (state, ctrl, changes))
     kernel = exact.compile_kernel(step, *one)

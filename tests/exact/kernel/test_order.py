@@ -64,16 +64,21 @@ def folds_of(function, *example):
 J = np.ones((40, 6), np.float32)
 
 
+def of_parts(j, d):
+    rows = jnp.concatenate([j[:9], 2 * j[9:]])
+    return jnp.einsum("ki,k,kj->ij", rows, d, rows)
+
+
 @pytest.mark.parametrize(
     "width, function",
     [
         (6, lambda j, d: j.T @ (d[:, None] * j)),
-        (6, lambda j, d: jnp.einsum("ki,k,kj->ij", jnp.concatenate([j[:9], 2 * j[9:]]), d, jnp.concatenate([j[:9], 2 * j[9:]]))),
+        (6, of_parts),
         (0, lambda j, d: j.T @ (d[:, None] * jnp.sin(j))),
         (0, lambda j, d: j.T @ (d[:, None] + j)),
         (0, lambda j, d: j[:, :3].T @ (j * d[:, None])),
     ],
-)  # fmt: skip
+)
 def test_a_square_of_sums_is_halved_where_it_is_symmetric(width, function):
     (fold,) = folds_of(function, J, J[:, 0])
     assert lanes.width_of(fold) == width

@@ -251,12 +251,19 @@ def drawn(x):
     """Expressions drawn at random, of values [4, 4] that read each other in every way."""
     rng, values = np.random.default_rng(0), [x, x.T, x + 1]
     steps = [
-        lambda a, b: a * b, lambda a, b: a - b.T, lambda a, b: jnp.sin(a) + b[0], lambda a, b: jnp.tanh(a @ b),
-        lambda a, b: jnp.where(a > b, a, b[::-1]), lambda a, b: a.at[1:3, INDEX[:2]].set(b[:2, :2]),
-        lambda a, b: jnp.concatenate([a[:1], b[:2], a[2:3]]), lambda a, b: a - a.mean(1) + b.max(0)[:, None],
-        lambda a, b: a[INDEX], lambda a, b: lax.fori_loop(0, 3, lambda i, c: jnp.tanh(c * 0.5 + b), a),
-        lambda a, b: lax.cond(a[0, 0] > b[1, 1], lambda: a * 0.5, lambda: b.T), lambda a, b: jnp.sort(a, 0) * 0.5,
-    ]  # fmt: skip
+        lambda a, b: a * b,
+        lambda a, b: a - b.T,
+        lambda a, b: jnp.sin(a) + b[0],
+        lambda a, b: jnp.tanh(a @ b),
+        lambda a, b: a[INDEX],
+        lambda a, b: jnp.where(a > b, a, b[::-1]),
+        lambda a, b: a.at[1:3, INDEX[:2]].set(b[:2, :2]),
+        lambda a, b: jnp.concatenate([a[:1], b[:2], a[2:3]]),
+        lambda a, b: a - a.mean(1) + b.max(0)[:, None],
+        lambda a, b: lax.fori_loop(0, 3, lambda i, c: jnp.tanh(c * 0.5 + b), a),
+        lambda a, b: lax.cond(a[0, 0] > b[1, 1], lambda: a * 0.5, lambda: b.T),
+        lambda a, b: jnp.sort(a, 0) * 0.5,
+    ]
     for _ in range(60):
         a, b = (values[-1 - min(int(rng.exponential(3.0)), len(values) - 1)] for _ in "ab")
         values.append(steps[rng.integers(len(steps))](a, b))
@@ -347,23 +354,19 @@ def test_what_has_no_rule_is_named_with_its_line():
     example = np.ones(5, np.float32), np.zeros(2, np.int32)
     found = exact.kernel_missing(unknown, *example)
     assert {x.primitive for x in found} >= {"scatter", "population_count"}
-    assert all(
-        "test_rules.py" in x.source for x in found if x.primitive in ("scatter", "population_count")
-    )
+    for one in found:
+        assert "test_rules.py" in one.source or "/jax/" in one.source  # of eigh, which JAX traces
     (scatter,) = [x for x in found if x.primitive == "scatter"]
     assert "known only while running" in scatter.why
-    with pytest.raises(
-        compiling.NoRuleError,
-        match=r"No kernel computes scatter of places .* at .*test_rules.py:\d+",
-    ):
+    said = r"No kernel computes scatter of places .* at .*test_rules.py:\d+"
+    with pytest.raises(compiling.NoRuleError, match=said):
         exact.compile_kernel(unknown, *example)
     assert not exact.kernel_missing(sums, np.ones(400, np.float32))
 
 
 def test_what_a_kernel_cannot_hold_is_refused():
-    with pytest.raises(
-        compiling.NoRuleError, match="memory for 90,001 numbers .* leave this step to XLA"
-    ):
+    said = "memory for 90,001 numbers .* leave this step to XLA"
+    with pytest.raises(compiling.NoRuleError, match=said):
         exact.compile_kernel(jnp.sum, np.ones(90_000, np.float32))
     with pytest.raises(compiling.NoRuleError, match="uint8"):
         exact.compile_kernel(lambda x: x.astype(jnp.uint8), np.ones(3, np.float32))
