@@ -87,10 +87,10 @@ class Cells:
         lines, result = self.code(code, [self.leaf(leaf) for leaf in code.leaves])
         return f"{each(size)} {{ {' '.join(lines)} {target} = {result}; }}"
 
-    def copy(self, value: Value, code: Code) -> str:
-        """Returns C that computes numbers and puts them where a value stands."""
+    def copy(self, value: Value, code: Code, size: int = 0) -> str:
+        """Returns C that computes numbers, by default a value's, and puts them where it stands."""
         target = self.memory(value.kind, f"{self.address[value]}+i")
-        return self.assign(target, value.size, code)
+        return self.assign(target, size or value.size, code)
 
 
 def each(size: int) -> str:

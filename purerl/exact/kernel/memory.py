@@ -21,7 +21,6 @@ class Memory(NamedTuple):
 
     address: dict[Value, int]  # by its home
     size: int
-    live: int  # numbers that are needed at once, at most: no memory can be smaller
 
 
 class _Span(NamedTuple):
@@ -101,9 +100,7 @@ def placed(scheduler: Scheduler, inputs: Sequence[Held]) -> Memory:
         for value in span.values:
             address[value] = place
             place += value.size
-    times = sorted({span.first for span in spans})
-    live = max(sum(s.size for s in spans if s.first <= t <= s.last) for t in times)
-    return Memory(address, max(size, 1), live + len(scheduler.slots))
+    return Memory(address, max(size, 1))
 
 
 def _orders(spans: Sequence[_Span]) -> Iterator[np.ndarray]:

@@ -24,17 +24,7 @@ def _elementwise(build: Builder, eqn: core.JaxprEqn, *args: Value) -> Value:
     kind = kind_of(eqn.outvars[0].aval.dtype)
     if eqn.primitive.name == "select_n" and len(args) > 3:
         return build.select(*args)
-    if eqn.primitive.name in ("and", "or", "xor", "not") and kind == "f":
-        raise NoRuleError("bits of real numbers")
     return build.map(eqn.primitive.name, *args, kind=kind, param=eqn.params.get("y"))
-
-
-def _clamp(build: Builder, eqn: core.JaxprEqn, low: Value, x: Value, high: Value) -> Value:
-    return build.map("min", build.map("max", x, low), high)
-
-
-def _same(build: Builder, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
-    return list(args)
 
 
 # --- other places: views ---
@@ -146,35 +136,18 @@ def _dynamic_slice(build: Builder, eqn: core.JaxprEqn, x: Value, *asked: Value) 
     return build.lookup(x, build.map("add", address, build.const(window)))
 
 
-def _dynamic_update(
-    build: Builder, eqn: core.JaxprEqn, x: Value, new: Value, *asked: Value
-) -> Value:
-    """Each number of the operand is read from the update, if it is within its window."""
-    inside: Value = build.const(np.ones(x.shape, bool))
-    offsets = []
-    for axis, (start, n, m) in enumerate(zip(asked, x.shape, new.shape, strict=True)):
-        place = build.const(np.indices(x.shape)[axis].astype(np.int32))
-        offset = build.map("sub", place, build.spread(_within(build, start, n - m), x.shape))
-        offsets.append(_within(build, offset, m - 1))
-        fits = build.map("eq", offset, offsets[-1], kind="b")
-        inside = build.map("and", inside, fits)
-    put = build.lookup(new, _address(build, offsets, _steps(new.shape)))
-    return build.map("select_n", inside, x, put, kind=x.kind)
-
-
 def _scatter(build: Builder, eqn: core.JaxprEqn, x: Value, indices: Value, new: Value) -> Value:
     """Puts, adds or multiplies updates at constant places, each by itself or in their order."""
     if not isinstance(indices, Const):
         raise NoRuleError("places that are known only while running")
-    op = eqn.primitive.name.removeprefix("scatter").lstrip("-_")
+    op = eqn.primitive.name.removeprefix("scatter").lstrip("-")
     if eqn.params.get("update_jaxpr") is not None and not op:
         raise NoRuleError("a function of the numbers that stand there")
     address = scatters.addresses(eqn, indices.array)
     for turn in _turns(address):
         put = build.take(new, turn)
         if op:
-            old = build.take(x, address[turn])
-            put = build.map(op, old, put)
+            put = build.map(op, build.take(x, address[turn]), put)
         which, place = np.zeros(x.size, int), np.arange(x.size)
         which[address[turn]], place[address[turn]] = 1, np.arange(len(turn))
         x = build.view([x, put], which, place.reshape(x.shape))
@@ -235,23 +208,23 @@ RULES: dict[str, Rule] = {
     "add_any": lambda build, eqn, x, y: build.map("add", x, y),
     "broadcast_in_dim": _place(_broadcast),
     "cholesky": _cholesky,
-    "clamp": _clamp,
+    "clamp": lambda build, eqn, low, x, high: build.map("min", build.map("max", x, low), high),
     "concatenate": lambda build, eqn, *xs: build.rows(np.concatenate, xs, eqn.params["dimension"]),
     "dynamic_slice": _dynamic_slice,
-    "dynamic_update_slice": _dynamic_update,
     "expand_dims": _reshape,
     "gather": _gather,
-    "optimization_barrier": _same,
+    "optimization_barrier": lambda build, eqn, *xs: list(xs),
     "pad": _pad,
     "reshape": _reshape,
     "rev": _place(lambda p, places: np.flip(places, p["dimensions"])),
-    **dict.fromkeys(("scatter", "scatter-add", "scatter_add"), _scatter),
-    **dict.fromkeys(("scatter-mul", "scatter_mul"), _scatter),
+    "scatter": _scatter,
+    "scatter-add": _scatter,
+    "scatter-mul": _scatter,
     "slice": _place(_sliced),
     "split": _split,
     "squeeze": _reshape,
     "stack": lambda build, eqn, *xs: build.rows(np.stack, xs, eqn.params["axis"]),
-    "stop_gradient": _same,
+    "stop_gradient": lambda build, eqn, x: x,
     "tile": _place(lambda p, places: np.tile(places, p.get("reps", p.get("repeats")))),
     "transpose": _place(lambda p, places: np.transpose(places, p["permutation"])),
     "triangular_solve": _solve,

@@ -123,19 +123,6 @@ def _order(build: Builder, keys: Sequence[Value]) -> Value:
     return build.fold("add", build.map("select_n", equal, zero, mine, kind="i"), places.shape)
 
 
-def _top_k(build: Builder, eqn: core.JaxprEqn, x: Value) -> list[Value]:
-    """The greatest k of the last axis, and where they were: NaN first, then as sorted."""
-    n, k = x.shape[-1], eqn.params["k"]
-    order = _order(build, [build.map("neg", x)])
-    if x.kind == "f":
-        nan = build.map("ne", x, x, kind="b")
-        order = _order(build, [build.map("not", nan), build.map("neg", x)])
-    order = build.take(order, order.places[..., :k])
-    first = (np.arange(x.size // n, dtype=np.int32) * n).reshape(*x.shape[:-1], 1)
-    address = build.map("add", order, build.const(np.broadcast_to(first, order.shape)))
-    return [build.lookup(x, address), order]
-
-
 RULES: dict[str, Rule] = {
     "argmax": _first_of("max"),
     "argmin": _first_of("min"),
@@ -150,5 +137,4 @@ RULES: dict[str, Rule] = {
     "reduce_prod": _reduce("mul"),
     "reduce_sum": _reduce("add"),
     "sort": _sort,
-    "top_k": _top_k,
 }

@@ -26,7 +26,6 @@ class Text(NamedTuple):
 
     body: str  # without the prelude
     memory: int  # numbers of 4 bytes for each environment
-    live: int  # of these needed at once
     statements: int
     inputs: tuple[tuple[int, str], ...]  # size and kind of each that is not empty
     outputs: tuple[tuple[int, str], ...]
@@ -53,8 +52,7 @@ def written(program: Program) -> Text:
     tables = [f"TABLE unsigned short T[] = {{{_numbers(places)}}};"]
     tables += [f"TABLE unsigned int C_[] = {{{_numbers(constants, 'u')}}};"]
     body = "\n".join([f"#define MEMORY {placed.size}", "PRELUDE", *tables, *lines, ""])
-    counts = placed.size, placed.live, writer.statements
-    return Text(body, *counts, *(tuple(x) for x in sizes))
+    return Text(body, placed.size, writer.statements, *(tuple(x) for x in sizes))
 
 
 def _numbers(arrays: Sequence[np.ndarray], suffix: str = "") -> str:
@@ -103,7 +101,11 @@ class _Writer(Cells):
                 yield from self._shared(list(some))
             for statement in plain:
                 if not statement.shared:
-                    yield self._fold(statement) if statement.fold else self._map(statement)
+                    yield (
+                        self._fold(statement)
+                        if statement.fold
+                        else self.copy(statement.writes[0], statement.code, statement.size)
+                    )
             for step in level:
                 if isinstance(step, StepStatement):
                     yield from self._step(step)
@@ -112,11 +114,6 @@ class _Writer(Cells):
         if copied and plan.copies:
             yield from (self.copy(value, code) for value, code in plan.copies)
             yield "SYNC;"
-
-    def _map(self, statement: Statement) -> str:
-        first = statement.writes[0]
-        target = self.memory(first.kind, f"{self.address[first]}+i")
-        return self.assign(target, statement.size, statement.code)
 
     def _fold(self, statement: Statement) -> str:
         """Each lane makes a row one number, from its first term to its last."""
@@ -161,11 +158,8 @@ class _Writer(Cells):
         def name(text: str) -> str:
             return known.setdefault(text, f"v{len(known)}")
 
-        leaves = [leaf._replace(which=leaf.which[row], at=leaf.at[row])
-                  if leaf.sources else leaf._replace(at=leaf.at[row])
-                  for leaf in code.leaves]  # fmt: skip
-        texts = [self.leaf(leaf) for leaf in leaves]
-        names = [name(text) for text in texts]
+        leaves = [x._replace(which=x.which[row], at=x.at[row]) for x in code.leaves]
+        names = [name(self.leaf(leaf)) for leaf in leaves]
         results: list[str] = []
         for line in code.lines:
             args = [names[~arg] if arg < 0 else results[arg] for arg in line.args]

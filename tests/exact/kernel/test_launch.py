@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from purerl import exact
-from purerl.exact.kernel import compilers
+from purerl.exact.kernel import compilers, launch
 from tests.exact.kernel import needs_compiler
 
 
@@ -45,6 +45,17 @@ def test_vmap_makes_one_call_of_any_batch(kernel):
     np.testing.assert_allclose(found["a"], wanted["a"], rtol=1e-6)
     assert (found["b"] == wanted["b"]).all()
     assert str(jax.make_jaxpr(over(kernel))(x, y)).count("kernel[") == 1
+
+
+@needs_compiler
+def test_a_batch_may_stand_on_any_axis(kernel):
+    rows = [
+        np.ones((n, 3), d)
+        for (n, _), d in zip(kernel.text.inputs, (np.int32, np.float32, np.float32), strict=True)
+    ]
+    rows[2][:, 1] = 2.0
+    found = jax.vmap(lambda *x: launch.run(kernel.text, *x), (1, 1, 1))(*rows)
+    np.testing.assert_array_equal(found[0][:, 0], [5.0, 17.0, 5.0])
 
 
 def batched(number):
