@@ -27,7 +27,7 @@ def ordered_scatter(eqn: core.JaxprEqn, inputs: Sequence, inside: Inside) -> lis
             "Compute the indices of a sum from constants; of MJX, change the model or ask for "
             "fewer readings, so that it is not needed."
         )
-    touched, turns = _order_of_sums(addresses(eqn, indices), updates.size)
+    touched, turns = order_of_sums(addresses(eqn, indices), updates.size)
     whole, flat = jnp.reshape(operand, (-1,)), jnp.reshape(updates, (-1,))
     if (turns == updates.size).any():
         flat = jnp.concatenate([flat, jnp.zeros(1, flat.dtype)])
@@ -109,7 +109,7 @@ def addresses(eqn: core.JaxprEqn, indices: np.ndarray) -> np.ndarray:
     return np.moveaxis(address, window_axes, d.update_window_dims).reshape(-1)
 
 
-def _order_of_sums(address: np.ndarray, none: int) -> tuple[np.ndarray, np.ndarray]:
+def order_of_sums(address: np.ndarray, none: int) -> tuple[np.ndarray, np.ndarray]:
     """Sorts updates by the address [updates] that they are added to; `none` stands for no update.
 
     Returns the addresses that receive an update, [touched], ascending; and for each the number of

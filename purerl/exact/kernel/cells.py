@@ -37,8 +37,7 @@ class Cells:
         first = numbers.flat[0]
         if (numbers == first).all() or (numbers != numbers).all():
             return _literal(first, kind)
-        at = f"{self.tables.constant(numbers, kind)}+{place}"
-        return f"C[{at}]" if kind == "f" else f"((int)C_[{at}])"
+        return _of_table(kind, f"{self.tables.constant(numbers, kind)}+{place}")
 
     def leaf(self, leaf: Leaf, number: str = "i") -> str:
         """Returns C for a leaf [n] at a place."""
@@ -78,8 +77,7 @@ class Cells:
             return operations.text_of(line.op, line.kind, line.param, *args)
         table = code.tables[line.param]
         if isinstance(table, Const):
-            at = self.tables.constant(table.array, table.kind)
-            return f"C[{at}+{args[0]}]" if line.kind == "f" else f"((int)C_[{at}+{args[0]}])"
+            return _of_table(line.kind, f"{self.tables.constant(table.array, line.kind)}+{args[0]}")
         return self.memory(line.kind, f"{self.address[home(table)]}+{args[0]}")
 
     def assign(self, target: str, size: int, code: Code) -> str:
@@ -96,6 +94,10 @@ class Cells:
 def each(size: int) -> str:
     """Returns C that does something for each i."""
     return f"EACH(i, {size})" if size > LANES else f"FEW(i, {size})"
+
+
+def _of_table(kind: str, place: str) -> str:
+    return f"C[{place}]" if kind == "f" else f"((int)C_[{place}])"
 
 
 def _name(number: int) -> str:

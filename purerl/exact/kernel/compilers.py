@@ -8,7 +8,6 @@ import ctypes
 import functools
 import hashlib
 import importlib.util
-import os
 import shutil
 import subprocess
 import tempfile
@@ -97,32 +96,28 @@ def for_gpu(text: Text, chip: int) -> str:
 
 def _ptx(library: Any, whole: str, words: tuple[str, ...]) -> bytes:
     program = ctypes.c_void_p()
-    asked = [word.encode() for word in words]
-    _checked(library, library.nvrtcCreateProgram(
-        ctypes.byref(program), whole.encode(), b"kernel.cu", 0, None, None))  # fmt: skip
+
+    def ask(name: str, *args: Any) -> None:
+        error = getattr(library, f"nvrtc{name}")(*args)
+        if error:
+            raise CompilerError(f"NVRTC's {name} fails with error {error}.")
+
+    def answer(name: str) -> bytes:
+        size = ctypes.c_size_t()
+        ask(f"Get{name}Size", program, ctypes.byref(size))
+        found = ctypes.create_string_buffer(size.value)
+        ask(f"Get{name}", program, found)
+        return found.raw.rstrip(b"\0")
+
+    ask("CreateProgram", ctypes.byref(program), whole.encode(), b"kernel.cu", 0, None, None)
     try:
-        array = (ctypes.c_char_p * len(asked))(*asked)
-        failed = library.nvrtcCompileProgram(program, len(asked), array)
-        if failed:
-            log = _text_of(library, program, "ProgramLog").decode(errors="replace")
+        array = (ctypes.c_char_p * len(words))(*(word.encode() for word in words))
+        if library.nvrtcCompileProgram(program, len(words), array):
+            log = answer("ProgramLog").decode(errors="replace")
             raise CompilerError(f"NVRTC refuses a kernel: {log[:500]}")
-        return _text_of(library, program, "PTX").rstrip(b"\0")
+        return answer("PTX")
     finally:
         library.nvrtcDestroyProgram(ctypes.byref(program))
-
-
-def _text_of(library: Any, program: ctypes.c_void_p, what: str) -> bytes:
-    size = ctypes.c_size_t()
-    _checked(library, getattr(library, f"nvrtcGet{what}Size")(program, ctypes.byref(size)))
-    found = ctypes.create_string_buffer(size.value)
-    _checked(library, getattr(library, f"nvrtcGet{what}")(program, found))
-    return found.raw
-
-
-def _checked(library: Any, error: int) -> None:
-    if error:
-        library.nvrtcGetErrorString.restype = ctypes.c_char_p
-        raise CompilerError(f"NVRTC fails: {library.nvrtcGetErrorString(error).decode()}")
 
 
 @functools.cache
@@ -158,7 +153,7 @@ def _kept(whole: str, words: tuple[str, ...], kind: str, make: Callable[[str], b
         made = make(whole)
         with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
             file.write(made)
-        os.replace(file.name, path)
+        Path(file.name).replace(path)
     return path
 
 

@@ -37,12 +37,10 @@ def copied_by(step: Step) -> list[Value]:
     return step.reads[-1:] if isinstance(step, values.Linear) else []
 
 
-def read_inside(step: Step) -> Iterator[tuple[Value, Block]]:
-    """Yields the values that a step reads at the end of a block inside of it."""
+def results_inside(step: Step) -> Iterator[tuple[Value, Block]]:
+    """Yields the values that a step copies at the end of a block inside of it."""
     if isinstance(step, values.Loop):
         yield from ((value, step.inner) for value in step.results)
-        if step.test and step.going:
-            yield step.going, step.test
     if isinstance(step, values.Choice):
         for block, results in zip(step.branches, step.results, strict=True):
             yield from ((value, block) for value in results)
@@ -109,24 +107,23 @@ def kept(top: Block, outputs: list[Value]) -> set[Value]:
 
 
 def _add_step(uses: Uses, step: Step) -> None:
-    """Notes what a step reads; what is copied to where it writes may be computed on the way."""
+    """Notes what a step reads: only a system's matrix, and results, have to stand in memory."""
     for value in step.reads:
-        copied = value in copied_by(step)
-        uses.add(value, step.block, False, stands=not copied)
-    for value, block in read_inside(step):
+        matrix = isinstance(step, values.Linear) and value is not step.reads[-1]
+        uses.add(value, step.block, False, stands=matrix)
+    if isinstance(step, values.Loop) and step.test and step.going:
+        uses.add(step.going, step.test, False)
+    for value, block in results_inside(step):
         uses.add(value, block, False, stands=True)
 
 
 def _add_args(uses: Uses, item: Map | Fold, is_kept: bool) -> None:
-    by_lanes = _by_lanes(item) or (not is_kept and uses.only_by_lanes[item])
+    shared = isinstance(item, Fold) and item.shared
+    by_lanes = shared or (not is_kept and uses.only_by_lanes[item])
     for arg in item.args if isinstance(item, Map) else [item.arg]:
         uses.add(arg, item.block, by_lanes)
     if isinstance(item, Map) and item.op == "lookup":
         uses.add(item.param, item.block, False, stands=True)
-
-
-def _by_lanes(item: Map | Fold) -> bool:
-    return isinstance(item, Fold) and item.shared
 
 
 def _is_kept(item: Map | Fold, uses: Uses) -> bool:
@@ -155,9 +152,7 @@ def _cost(value: Value, keep: set[Value], costs: dict[Value, int]) -> int:
     """Returns what computing one number anew costs."""
     if isinstance(value, View):
         return max(_cost(source, keep, costs) for source in value.sources)
-    return (
-        0 if value in keep or isinstance(value, values.Const | values.Held) else costs.get(value, 0)
-    )
+    return 0 if value in keep else costs.get(value, 0)
 
 
 def _may_be_repeated(item: Map, uses: Uses) -> bool:

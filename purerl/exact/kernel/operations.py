@@ -19,10 +19,6 @@ class Operation(NamedTuple):
     cost: int = 1  # in additions, roughly
 
 
-def _compare(sign: str, compute: Callable) -> Operation:
-    return Operation(f"({{}} {sign} {{}})", compute)
-
-
 def _power(kind: str, exponent: int) -> str:
     """By multiplication: a square is the most frequent one."""
     times = "*".join(["{0}"] * abs(exponent)) or "1"
@@ -38,9 +34,6 @@ def _remainder(x: Any, y: Any) -> Any:
 
 
 OPERATIONS = {
-    "add": Operation("({} + {})", np.add),
-    "sub": Operation("({} - {})", np.subtract),
-    "mul": Operation("({} * {})", np.multiply),
     "div": Operation("({} / {})", None, 8),
     "neg": Operation("(-{})", np.negative),
     "abs": Operation(lambda kind, _: "fabsf({})" if kind == "f" else "abs({})", np.abs),
@@ -57,15 +50,6 @@ OPERATIONS = {
     "rem": Operation(
         lambda kind, _: "fmodf({}, {})" if kind == "f" else "rest_of({}, {})", _remainder, 10
     ),
-    "lt": _compare("<", np.less),
-    "le": _compare("<=", np.less_equal),
-    "gt": _compare(">", np.greater),
-    "ge": _compare(">=", np.greater_equal),
-    "eq": _compare("==", np.equal),
-    "ne": _compare("!=", np.not_equal),
-    "and": _compare("&", np.bitwise_and),
-    "or": _compare("|", np.bitwise_or),
-    "xor": _compare("^", np.bitwise_xor),
     "not": Operation(lambda kind, _: "(!{})" if kind == "b" else "(~{})", np.invert),
     "is_finite": Operation("is_finite({})", np.isfinite),
     "select_n": Operation("({0} ? {2} : {1})", lambda which, no, yes: np.where(which, yes, no)),
@@ -73,6 +57,12 @@ OPERATIONS = {
     "copy": Operation("{}"),
     "lookup": Operation("{}"),  # of a place in the memory of another value: written by `text.py`
 }
+_SIGNS = {"add": "+", "sub": "-", "mul": "*", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
+_SIGNS |= {"eq": "==", "ne": "!=", "and": "&", "or": "|", "xor": "^"}
+_BINARY = [np.add, np.subtract, np.multiply, np.less, np.less_equal, np.greater, np.greater_equal]
+_BINARY += [np.equal, np.not_equal, np.bitwise_and, np.bitwise_or, np.bitwise_xor]
+for (_name, _sign), _compute in zip(_SIGNS.items(), _BINARY, strict=True):
+    OPERATIONS[_name] = Operation(f"({{}} {_sign} {{}})", _compute)
 # Functions of C's and numpy's own names, and others.
 _SAME = "cbrt ceil cos cosh exp exp2 expm1 floor log log1p sin sinh tan tanh".split()  # noqa: SIM905
 _OTHERS = {"asin": "arcsin", "acos": "arccos", "atan": "arctan"}

@@ -86,9 +86,8 @@ class _Reader:
 
     def _unknown(self, aval: Any) -> Held:
         """Returns what stands for a result that has no rule, while all of these are listed."""
-        integral = np.issubdtype(aval.dtype, np.integer)
-        known = aval.dtype if aval.dtype == bool else np.int32 if integral else np.float32
-        return self.build.held(aval.shape, known)
+        kinds = {"b": np.bool_, "f": np.float32}
+        return self.build.held(aval.shape, kinds.get(np.dtype(aval.dtype).kind, np.int32))
 
     def _round(
         self, role: str, carry: Sequence[Held], function: Callable[..., list[Value]]

@@ -15,7 +15,7 @@ from purerl.exact import scatters
 from purerl.exact.kernel import rules_of_rows
 from purerl.exact.kernel.builder import Builder
 from purerl.exact.kernel.operations import OPERATIONS
-from purerl.exact.kernel.values import Const, NoRuleError, Value, View, kind_of
+from purerl.exact.kernel.values import DTYPES, Const, NoRuleError, Value, View, kind_of
 
 Rule = Callable[..., Any]
 
@@ -117,15 +117,10 @@ def _gather(build: Builder, eqn: core.JaxprEqn, x: Value, indices: Value) -> Val
     fits: Value = build.const(np.ones(len(at), bool))
     for one, other in zip(asked, starts, strict=True):
         fits = build.map("and", fits, build.map("eq", one, other, kind="b"))
-    filler = build.spread(build.const(_filler(p["fill_value"], x.kind)), shape)
+    nothing = {"f": np.nan, "i": np.iinfo(np.int32).min, "b": True}[x.kind]
+    filler = nothing if p["fill_value"] is None else p["fill_value"]
+    filler = build.spread(build.const(filler, DTYPES[x.kind]), shape)
     return build.map("select_n", build.take(fits, row), filler, found, kind=x.kind)
-
-
-def _filler(value: Any, kind: str) -> np.ndarray:
-    """Returns what a gather has where its window does not fit."""
-    if value is None:
-        value = {"f": np.nan, "i": np.iinfo(np.int32).min, "b": True}[kind]
-    return np.asarray(value, {"f": np.float32, "i": np.int32, "b": bool}[kind])
 
 
 def _dynamic_slice(build: Builder, eqn: core.JaxprEqn, x: Value, *asked: Value) -> Value:
@@ -143,27 +138,17 @@ def _scatter(build: Builder, eqn: core.JaxprEqn, x: Value, indices: Value, new: 
     op = eqn.primitive.name.removeprefix("scatter").lstrip("-")
     if eqn.params.get("update_jaxpr") is not None and not op:
         raise NoRuleError("a function of the numbers that stand there")
-    address = scatters.addresses(eqn, indices.array)
-    for turn in _turns(address):
-        put = build.take(new, turn)
+    addresses = scatters.addresses(eqn, indices.array)
+    touched, turns = scatters.order_of_sums(addresses, new.size)
+    for turn in turns:
+        address, update = touched[turn < new.size], turn[turn < new.size]
+        put = build.take(new, update)
         if op:
-            put = build.map(op, build.take(x, address[turn]), put)
+            put = build.map(op, build.take(x, address), put)
         which, place = np.zeros(x.size, int), np.arange(x.size)
-        which[address[turn]], place[address[turn]] = 1, np.arange(len(turn))
+        which[address], place[address] = 1, np.arange(len(address))
         x = build.view([x, put], which, place.reshape(x.shape))
     return x
-
-
-def _turns(address: np.ndarray) -> list[np.ndarray]:
-    """Splits updates into groups, in their order, so that no two of one meet at an address."""
-    turn_of: dict[int, int] = {}
-    groups: list[list[int]] = []
-    for update in np.flatnonzero(address >= 0):
-        turn = turn_of.get(address[update], 0)
-        turn_of[address[update]] = turn + 1
-        groups += [[]] if turn == len(groups) else []
-        groups[turn].append(update)
-    return [np.array(group) for group in groups]
 
 
 # --- linear systems ---
