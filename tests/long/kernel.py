@@ -89,12 +89,12 @@ def take(way: str) -> None:
 
 
 class Subject(NamedTuple):
-    """A control step, and what it is called with."""
+    """A control step, and where environments start."""
 
     step: Callable  # (state, ctrl, changes) of one environment, as engine `jax` has it
     exact_step: Callable  # the same with sums in a fixed order, as a training uses it
-    state: Any
-    ctrl: np.ndarray  # [nu]
+    start: Callable  # number -> (states, changes) of so many environments
+    controls: int  # nu
 
 
 def subject(experiment: str, words: list[str]) -> Subject:
@@ -102,38 +102,39 @@ def subject(experiment: str, words: list[str]) -> Subject:
     chosen, _ = command_line.from_command_line(
         find_source(experiment), [*words, "--engine", "jax"], experiment
     )
-    physics = chosen.build_env(chosen.env, "jax").physics
+    env = chosen.build_env(chosen.env, "jax")
 
     def step(state: Any, ctrl: Any, changes: dict) -> Any:
         with mjx_defaults():
-            return physics._engine.plain_step(state, ctrl, changes)
+            return env.physics._engine.plain_step(state, ctrl, changes)
 
-    qpos = jnp.asarray(physics.model.qpos0, jnp.float32)
-    state = jax.jit(physics.init)(qpos, jnp.zeros(physics.model.nv))[0]
-    return Subject(step, physics.step, state, np.zeros(physics.model.nu, np.float32))
+    def begun(number: jax.Array) -> Any:
+        state = env.reset(jax.random.fold_in(jax.random.key(0), number))
+        changes = env.model_changes(state) if hasattr(env, "model_changes") else {}
+        return state.physics, changes
+
+    # The same for an environment, whatever the number of them.
+    start = lambda number: jax.jit(jax.vmap(begun))(jnp.arange(number))  # noqa: E731
+    return Subject(step, env.physics.step, start, env.physics.model.nu)
 
 
 def controls(of: Subject, number: int, seed: int) -> np.ndarray:
     """Returns random controls [number, nu]: the same for an environment whatever the number."""
-    draw = [np.random.default_rng([seed, i]).uniform(-1, 1, of.ctrl.shape) for i in range(number)]
-    return np.stack(draw).astype(np.float32)
-
-
-def repeated(of: Subject, number: int) -> Any:
-    """Returns the first state for each of so many environments."""
-    return jax.tree.map(lambda x: jnp.broadcast_to(x, (number, *x.shape)), of.state)
+    draws = [np.random.default_rng([seed, i]).uniform(-1, 1, of.controls) for i in range(number)]
+    return np.stack(draws).astype(np.float32)
 
 
 def stepped(step: Callable) -> Callable:
-    """Returns a program of one control step: (states, controls) -> states."""
-    return jax.jit(jax.vmap(lambda state, ctrl: step(state, ctrl, {})[0]))
+    """Returns a program of one control step: (states, controls, changes) -> states."""
+    return jax.jit(jax.vmap(lambda state, ctrl, changes: step(state, ctrl, changes)[0]))
 
 
-def repeat(program: Callable, state: Any, ctrl: Any) -> Any:
-    """Makes some control steps under one control."""
+def repeat(program: Callable, start: Any, ctrl: Any) -> Any:
+    """Makes some control steps under one control; returns (states, changes)."""
+    state, changes = start
     for _ in range(ROUNDS):
-        state = program(state, ctrl)
-    return jax.block_until_ready(state)
+        state = program(state, ctrl, changes)
+    return jax.block_until_ready((state, changes))
 
 
 def rules(way: str) -> str:
@@ -156,11 +157,11 @@ def rules(way: str) -> str:
 
 def agreement(of: Subject, kernel: Callable, by_xla: Callable) -> compiling.Agreement:
     """Compares a control step with XLA's, on states that XLA has reached."""
-    state = repeated(of, BESIDE)
+    state, changes = of.start(BESIDE)
     for seed in range(REACHED):
-        state = by_xla(state, controls(of, BESIDE, seed))
+        state = by_xla(state, controls(of, BESIDE, seed), changes)
     ctrl = controls(of, BESIDE, REACHED)
-    results = [run(state, ctrl) for run in (stepped(kernel), by_xla)]
+    results = [run(state, ctrl, changes) for run in (stepped(kernel), by_xla)]
     flat = [[np.reshape(x, (BESIDE, -1)) for x in jax.tree.leaves(y)] for y in results]
     found = compiling.agreement(*(np.concatenate(x, 1) for x in flat))
     if not found.agrees:
@@ -170,7 +171,7 @@ def agreement(of: Subject, kernel: Callable, by_xla: Callable) -> compiling.Agre
 
 def digest(of: Subject, kernel: Callable, number: int, first: int) -> str:
     """Returns the digest of the first environments' states after some control steps."""
-    state = repeat(stepped(kernel), repeated(of, number), controls(of, number, 0))
+    state, _ = repeat(stepped(kernel), of.start(number), controls(of, number, 0))
     rows = [np.asarray(x)[:first].tobytes() for x in jax.tree.leaves(state)]
     return hashlib.sha256(b"".join(rows)).hexdigest()[:16]
 
@@ -190,13 +191,13 @@ def digests(of: Subject, kernel: Callable, words: list[str]) -> str:
 
 def rate(of: Subject, programs: list[Callable], number: int) -> str:
     """Returns the median rates of programs, in turns [control steps/s]."""
-    state, ctrl = repeated(of, number), controls(of, number, 0)
-    state = [repeat(program, state, ctrl) for program in programs][0]
+    start, ctrl = of.start(number), controls(of, number, 0)
+    start = [repeat(program, start, ctrl) for program in programs][0]
     seconds: list[list[float]] = [[] for _ in programs]
     for _ in range(TURNS):
         for program, taken in zip(programs, seconds, strict=True):
             begin = time.perf_counter()
-            repeat(program, state, ctrl)
+            repeat(program, start, ctrl)
             taken.append(time.perf_counter() - begin)
     found = [number * ROUNDS / float(np.median(taken)) for taken in seconds]
     spread = [f"{max(x) / min(x):.2f}" for x in seconds]
@@ -221,7 +222,11 @@ def main() -> int:
     if jax.default_backend() != "gpu":
         sys.exit("JAX finds no GPU. On a CPU, tests/exact/kernel runs the same text.")
     of = subject(options.experiment, options.words)
-    make = lambda: exact.compile_kernel(of.step, of.state, of.ctrl, {})  # noqa: E731
+
+    def make() -> compiling.Kernel:
+        state, changes = jax.tree.map(lambda x: x[0], of.start(1))
+        return exact.compile_kernel(of.step, state, np.zeros(of.controls, np.float32), changes)
+
     if "--only-digest" in sys.argv:
         take(options.way or "xla")
         print(digest(of, make(), NUMBERS[1], NUMBERS[0]))

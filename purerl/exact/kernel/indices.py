@@ -19,7 +19,6 @@ class Tables:
 
     def place(self, index: np.ndarray) -> int:
         """Returns where a map of places begins in the table T."""
-        assert not index.size or 0 <= index.min() <= index.max() < 1 << 16, "beyond 16 bits"
         return self._put("T", self.places, index.astype(np.uint16))
 
     def constant(self, numbers: np.ndarray, kind: str) -> int:

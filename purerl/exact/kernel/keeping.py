@@ -64,6 +64,8 @@ class Uses:
         self.blocks: dict[Value, set[Block]] = collections.defaultdict(set)
         self.only_by_lanes: dict[Value, bool] = {}
         self.as_they_stand: set[Value] = set()  # read by a step, or by a view of several values
+        self.keep: set[Value] = set()
+        self.costs: dict[Value, int] = {}  # of computing one number of a value that is not kept
 
     def add(self, value: Value, block: Block, by_lanes: bool, stands: bool = False) -> None:
         """Notes that something in a block reads a value; a view passes it on."""
@@ -82,7 +84,6 @@ class Uses:
 def kept(top: Block, outputs: list[Value]) -> set[Value]:
     """Returns the maps and folds that stand in memory."""
     uses = Uses()
-    keep: set[Value] = set()
     for value in outputs:
         uses.add(value, top, False, stands=True)
     items = list(in_order(top))
@@ -90,20 +91,18 @@ def kept(top: Block, outputs: list[Value]) -> set[Value]:
         if isinstance(item, Step):
             _add_step(uses, item)
         elif uses.number[item] and _is_kept(item, uses):
-            keep.add(item)
+            uses.keep.add(item)
         if isinstance(item, Map | Fold) and uses.number[item]:
-            _add_args(uses, item, item in keep)
-    costs: dict[Value, int] = {}
+            _add_args(uses, item)
     for item in items:
+        if isinstance(item, Map | Fold) and uses.number[item]:
+            _keep_what_repeats(item, uses)
         if isinstance(item, Map) and uses.number[item]:
-            _keep_what_repeats(item, keep, costs, uses)
-            costs[item] = OPERATIONS[item.op].cost + sum(_cost(x, keep, costs) for x in item.args)
-            cheap = CHEAP_OF_LARGE if item.size >= LARGE else CHEAP
-            if item in keep and costs[item] <= cheap and _may_be_repeated(item, uses):
-                keep.remove(item)
-        elif isinstance(item, Fold) and uses.number[item]:
-            _keep_what_repeats(item, keep, costs, uses)
-    return keep
+            cost = OPERATIONS[item.op].cost + sum(_cost(x, uses) for x in item.args)
+            uses.costs[item] = cost
+            if cost <= (CHEAP_OF_LARGE if item.size >= LARGE else CHEAP):
+                uses.keep -= {item} if _may_be_repeated(item, uses) else set()
+    return uses.keep
 
 
 def _add_step(uses: Uses, step: Step) -> None:
@@ -117,9 +116,9 @@ def _add_step(uses: Uses, step: Step) -> None:
         uses.add(value, block, False, stands=True)
 
 
-def _add_args(uses: Uses, item: Map | Fold, is_kept: bool) -> None:
+def _add_args(uses: Uses, item: Map | Fold) -> None:
     shared = isinstance(item, Fold) and item.shared
-    by_lanes = shared or (not is_kept and uses.only_by_lanes[item])
+    by_lanes = shared or (item not in uses.keep and uses.only_by_lanes[item])
     for arg in item.args if isinstance(item, Map) else [item.arg]:
         uses.add(arg, item.block, by_lanes)
     if isinstance(item, Map) and item.op == "lookup":
@@ -134,25 +133,23 @@ def _is_kept(item: Map | Fold, uses: Uses) -> bool:
     return uses.number[item] > 1 and not terms
 
 
-def _keep_what_repeats(
-    item: Map | Fold, keep: set[Value], costs: dict[Value, int], uses: Uses
-) -> None:
+def _keep_what_repeats(item: Map | Fold, uses: Uses) -> None:
     """Keeps arguments of which the same numbers would be computed too often."""
     for arg in item.args if isinstance(item, Map) else [item.arg]:
         if isinstance(arg, View) and len(arg.sources) == 1 and arg.size:
             (source,) = arg.sources
             often = int(np.bincount(arg.index).max())
             terms = uses.only_by_lanes.get(source, False)
-            costly = often > 1 and often * _cost(source, keep, costs) > MOST_REPEATED
+            costly = often > 1 and often * _cost(source, uses) > MOST_REPEATED
             if isinstance(source, Map) and costly and not terms:
-                keep.add(source)
+                uses.keep.add(source)
 
 
-def _cost(value: Value, keep: set[Value], costs: dict[Value, int]) -> int:
+def _cost(value: Value, uses: Uses) -> int:
     """Returns what computing one number anew costs."""
     if isinstance(value, View):
-        return max(_cost(source, keep, costs) for source in value.sources)
-    return 0 if value in keep else costs.get(value, 0)
+        return max(_cost(source, uses) for source in value.sources)
+    return 0 if value in uses.keep else uses.costs.get(value, 0)
 
 
 def _may_be_repeated(item: Map, uses: Uses) -> bool:

@@ -18,7 +18,6 @@ from purerl.exact.kernel.values import Fold, Map, Value, View
 LANES = 32  # of a warp, which computes one environment
 FEW_ROWS = 16  # of a fold whose rows the lanes share; of more rows each has a lane
 WIDEST = 32  # a square of sums, such as a Hessian, is shared too, if it has no more columns
-MOST_FACTORS = 4  # of its terms
 
 
 def are_shared(fold: Fold) -> bool:
@@ -33,8 +32,6 @@ def width_of(fold: Fold) -> int:
     if not products or n * n != fold.size or not 1 < n <= WIDEST:
         return 0
     factors = list(_factors(fold.arg, np.arange(fold.arg.size)))
-    if len(factors) > MOST_FACTORS:
-        return 0
     ids, index = (np.stack(parts, -1) for parts in zip(*factors, strict=True))
     _, number = np.unique(ids, return_inverse=True)
     factor = (number.reshape(ids.shape) * (1 << 32) + index).reshape(n, n, fold.terms, -1)

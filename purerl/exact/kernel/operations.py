@@ -59,8 +59,9 @@ OPERATIONS = {
 }
 _SIGNS = {"add": "+", "sub": "-", "mul": "*", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
 _SIGNS |= {"eq": "==", "ne": "!=", "and": "&", "or": "|", "xor": "^"}
-_BINARY = [np.add, np.subtract, np.multiply, np.less, np.less_equal, np.greater, np.greater_equal]
-_BINARY += [np.equal, np.not_equal, np.bitwise_and, np.bitwise_or, np.bitwise_xor]
+_BINARY: list[Callable] = [np.add, np.subtract, np.multiply, np.less, np.less_equal, np.greater]
+_BINARY += [np.greater_equal, np.equal, np.not_equal]
+_BINARY += [np.bitwise_and, np.bitwise_or, np.bitwise_xor]
 for (_name, _sign), _compute in zip(_SIGNS.items(), _BINARY, strict=True):
     OPERATIONS[_name] = Operation(f"({{}} {_sign} {{}})", _compute)
 # Functions of C's and numpy's own names, and others.

@@ -89,28 +89,24 @@ class _Reader:
         kinds = {"b": np.bool_, "f": np.float32}
         return self.build.held(aval.shape, kinds.get(np.dtype(aval.dtype).kind, np.int32))
 
-    def _round(
-        self, role: str, carry: Sequence[Held], function: Callable[..., list[Value]]
-    ) -> tuple[Block, list[Value]]:
-        """Returns a block that is a function of the carry, and its results."""
+    def _round(self, role: str, carry: Sequence[Held], closed: Any, consts: Any) -> tuple:
+        """Returns a block that runs a trace on the carry, and its results."""
         with self.build.inside(role) as block:
             names = [Held(x.shape, x.kind, block, x) for x in carry]
-            return block, function(*names)
+            return block, self.run(closed, *consts, *names)
 
     def _carry(self, starts: Sequence[Value]) -> list[Held]:
         return [Held(x.shape, x.kind, self.build.blocks[-1]) for x in starts]
 
 
 def _while(reader: _Reader, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
-    p, run = eqn.params, reader.run
+    p = eqn.params
     if p["cond_jaxpr"].out_avals[0].shape:
         raise NoRuleError("a vmapped loop")
     n, m = p["cond_nconsts"], p["body_nconsts"]
     carry = reader._carry(args[n + m :])
-    test, (going,) = reader._round("while", carry, lambda *xs: run(p["cond_jaxpr"], *args[:n], *xs))
-    body, results = reader._round(
-        "while", carry, lambda *xs: run(p["body_jaxpr"], *args[n : n + m], *xs)
-    )
+    test, (going,) = reader._round("while", carry, p["cond_jaxpr"], args[:n])
+    body, results = reader._round("while", carry, p["body_jaxpr"], args[n : n + m])
     here, starts = reader.build.blocks[-1], list(args[n + m :])
     return [*reader.build.step(values.Loop(here, starts, carry, body, results, None, test, going))]
 
@@ -121,7 +117,7 @@ def _scan(reader: _Reader, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
     if len(args) > n + m or len(eqn.outvars) > m:
         return _written_out(reader, p, args, n, m)
     carry = reader._carry(args[n:])
-    body, results = reader._round("scan", carry, lambda *xs: reader.run(p["jaxpr"], *args[:n], *xs))
+    body, results = reader._round("scan", carry, p["jaxpr"], args[:n])
     step = values.Loop(reader.build.blocks[-1], list(args[n:]), carry, body, results, p["length"])
     return list(reader.build.step(step))
 

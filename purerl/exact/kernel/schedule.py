@@ -9,7 +9,9 @@ from purerl.exact.kernel import keeping, statements, values
 from purerl.exact.kernel.levels import levels_of
 from purerl.exact.kernel.reading import Program
 from purerl.exact.kernel.statements import SLOTS, Code, Leaf, Line, Plan, Statement, StepStatement
-from purerl.exact.kernel.values import Const, Fold, Held, Map, Value, View, home
+from purerl.exact.kernel.values import Block, Const, Fold, Held, Map, Value, View, home
+
+Pairs = Sequence[tuple[Value, Held]]
 
 
 class Scheduler:
@@ -21,7 +23,8 @@ class Scheduler:
         self.slots: dict[int, int] = {}
         self.keep = keeping.kept(program.block, program.outputs)
         self.outputs = [Held(x.shape, x.kind, program.block) for x in program.outputs]
-        self.plan = self._plan(program.block, program.outputs, self.outputs)
+        pairs = list(zip(program.outputs, self.outputs, strict=True))
+        self.plan = self._plan(program.block, pairs, True)
 
     def code(self, value: Value, places: np.ndarray) -> Code:
         """Returns the code of a value's numbers at places, [...]."""
@@ -29,22 +32,16 @@ class Scheduler:
         code.result = _Expression(self, code).add(value, places)
         return code
 
-    def _plan(
-        self,
-        block: values.Block,
-        results: Sequence[Value] = (),
-        into: Sequence[Held] = (),
-        test: Value | None = None,
-        in_step: bool = True,
-    ) -> Plan:
+    def _plan(self, block: Block, pairs: Pairs, in_step: bool, test: Value | None = None) -> Plan:
+        """Plans a block, of which each pair (result, target) is copied at its end."""
         made: list[Any] = []
         for item in block.items:
             if isinstance(item, values.Step):
                 made.append(self._step(item, in_step))
             elif item in self.keep:
                 made.append(self._statement(item))
-        copies, homes = [], {home(x) for x in into}
-        for value, target in zip(results, into, strict=True):
+        copies, homes = [], {home(x) for _, x in pairs}
+        for value, target in pairs:
             if home(value) is home(target) or not value.size:
                 continue
             code = self._copy(value)
@@ -77,12 +74,13 @@ class Scheduler:
         if isinstance(step, values.Loop):
             in_step = in_step and step.rounds is not None
             if step.test:
-                plans.append(self._plan(step.test, test=step.going, in_step=False))
-            plans.append(self._plan(step.inner, step.results, step.writes, in_step=in_step))
+                plans.append(self._plan(step.test, [], False, step.going))
+            pairs = list(zip(step.results, step.writes, strict=True))
+            plans.append(self._plan(step.inner, pairs, in_step))
         if isinstance(step, values.Choice):
             which = self._copy(step.reads[0])
             for block, results in zip(step.branches, step.results, strict=True):
-                plans.append(self._plan(block, results, step.writes, in_step=False))
+                plans.append(self._plan(block, [*zip(results, step.writes, strict=True)], False))
         return StepStatement(step, copies, plans, which)
 
     def slots_of(self, constant: Const, index: np.ndarray) -> np.ndarray:
