@@ -100,8 +100,10 @@ def kept(top: Block, outputs: list[Value]) -> set[Value]:
         if isinstance(item, Map) and uses.number[item]:
             cost = OPERATIONS[item.op].cost + sum(_cost(x, uses) for x in item.args)
             uses.costs[item] = cost
-            if cost <= (CHEAP_OF_LARGE if item.size >= LARGE else CHEAP):
-                uses.keep -= {item} if _may_be_repeated(item, uses) else set()
+            here = uses.blocks[item] == {item.block} and item not in uses.as_they_stand
+            cheap = cost <= (CHEAP_OF_LARGE if item.size >= LARGE else CHEAP)
+            if here and cheap and uses.number[item] <= FEW_USES:
+                uses.keep.discard(item)
     return uses.keep
 
 
@@ -150,8 +152,3 @@ def _cost(value: Value, uses: Uses) -> int:
     if isinstance(value, View):
         return max(_cost(source, uses) for source in value.sources)
     return 0 if value in uses.keep else uses.costs.get(value, 0)
-
-
-def _may_be_repeated(item: Map, uses: Uses) -> bool:
-    here = uses.blocks[item] == {item.block} and item not in uses.as_they_stand
-    return here and uses.number[item] <= FEW_USES

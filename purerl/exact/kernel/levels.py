@@ -34,17 +34,16 @@ def levels_of(statements: Sequence[Any], at_end: set[Value]) -> list[list[Any]]:
             last[one] = min(last[one], late[number])
     sizes = [sum(x.size for x in s.writes) for s in statements]
     stays = [any(home(x) in at_end for x in s.writes) for s in statements]
-    level_of = min((early, late), key=lambda order: _memory(order, needs, sizes, stays, end))
+    level_of = min((early, late), key=lambda order: _memory(order, needs, sizes, stays))
     levels: list[list[Any]] = [[] for _ in range(end)]
     for statement, level in zip(statements, level_of, strict=True):
         levels[level].append(statement)
     return levels
 
 
-def _memory(
-    order: list[int], needs: list[set[int]], sizes: list[int], stays: list[bool], end: int
-) -> float:
+def _memory(order: list[int], needs: list[set[int]], sizes: list[int], stays: list[bool]) -> float:
     """Returns how many numbers are needed at once, at most."""
+    end = max(order, default=0) + 1
     until = [end if stay else level for stay, level in zip(stays, order, strict=True)]
     for number, needed in enumerate(needs):
         for one in needed:

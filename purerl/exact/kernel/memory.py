@@ -16,23 +16,13 @@ from purerl.exact.kernel.values import Held, Value, home
 TRIES = 24
 
 
-class Memory(NamedTuple):
-    """The place of each value, in numbers of 4 bytes."""
-
-    address: dict[Value, int]  # by its home
-    size: int
-
-
 class _Span(NamedTuple):
-    """Values side by side, and when they are needed."""
+    """Values side by side: how many numbers, and when they are needed."""
 
     values: list[Value]
+    size: int
     first: int
     last: int
-
-    @property
-    def size(self) -> int:
-        return sum(x.size for x in self.values)
 
 
 class _Clock:
@@ -73,6 +63,12 @@ class _Clock:
         if plan.test:
             self.read(plan.test.reads())
 
+    def spans(self) -> list[_Span]:
+        """Returns when each group of values is needed."""
+        when = [(min(self.first[x] for x in g), max(self.last[x] for x in g)) for g in self.groups]
+        sizes = [sum(x.size for x in group) for group in self.groups]
+        return [_Span(g, n, *w) for g, n, w in zip(self.groups, sizes, when, strict=True)]
+
     def _step(self, statement: StepStatement) -> None:
         self.read(statement.reads())
         self.write(statement.writes)
@@ -85,14 +81,16 @@ class _Clock:
         self.read(set(statement.writes))
 
 
-def placed(scheduler: Scheduler, inputs: Sequence[Held]) -> Memory:
-    """Returns a place for every value but the outputs, which are copied to the caller's arrays."""
+def placed(scheduler: Scheduler, inputs: Sequence[Held]) -> tuple[dict[Value, int], int]:
+    """Returns a place for each value, by its home, and the size of the memory [4 bytes].
+
+    Outputs have none: they are copied to the caller's arrays.
+    """
     clock = _Clock()
     for one in inputs:
         clock.write([one])
     clock.run(scheduler.plan)
-    spans = [_Span(g, min(clock.first[x] for x in g), max(clock.last[x] for x in g))
-             for g in clock.groups]  # fmt: skip
+    spans = clock.spans()
     tries = [_first_fit(spans, order, len(scheduler.slots)) for order in _orders(spans)]
     size, places = min(tries, key=lambda found: found[0])
     address: dict[Value, int] = {SLOTS: 0}
@@ -100,7 +98,7 @@ def placed(scheduler: Scheduler, inputs: Sequence[Held]) -> Memory:
         for value in span.values:
             address[value] = place
             place += value.size
-    return Memory(address, max(size, 1))
+    return address, max(size, 1)
 
 
 def _orders(spans: Sequence[_Span]) -> Iterator[np.ndarray]:

@@ -59,11 +59,10 @@ OPERATIONS = {
 }
 _SIGNS = {"add": "+", "sub": "-", "mul": "*", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
 _SIGNS |= {"eq": "==", "ne": "!=", "and": "&", "or": "|", "xor": "^"}
-_BINARY: list[Callable] = [np.add, np.subtract, np.multiply, np.less, np.less_equal, np.greater]
-_BINARY += [np.greater_equal, np.equal, np.not_equal]
-_BINARY += [np.bitwise_and, np.bitwise_or, np.bitwise_xor]
-for (_name, _sign), _compute in zip(_SIGNS.items(), _BINARY, strict=True):
-    OPERATIONS[_name] = Operation(f"({{}} {_sign} {{}})", _compute)
+_OF_NUMPY = """add subtract multiply less less_equal greater greater_equal equal not_equal
+bitwise_and bitwise_or bitwise_xor""".split()  # noqa: SIM905
+for (_name, _sign), _numpy in zip(_SIGNS.items(), _OF_NUMPY, strict=True):
+    OPERATIONS[_name] = Operation(f"({{}} {_sign} {{}})", getattr(np, _numpy))
 # Functions of C's and numpy's own names, and others.
 _SAME = "cbrt ceil cos cosh exp exp2 expm1 floor log log1p sin sinh tan tanh".split()  # noqa: SIM905
 _OTHERS = {"asin": "arcsin", "acos": "arccos", "atan": "arctan"}

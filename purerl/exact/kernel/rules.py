@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jax.extend import core
 
-from purerl.exact import scatters
+from purerl.exact import constants, scatters
 from purerl.exact.kernel import rules_of_rows
 from purerl.exact.kernel.builder import Builder
 from purerl.exact.kernel.operations import OPERATIONS
@@ -37,16 +37,6 @@ def _place(function: Callable[[dict, np.ndarray], np.ndarray]) -> Rule:
 
 def _reshape(build: Builder, eqn: core.JaxprEqn, x: Value) -> Value:
     return build.take(x, x.places.reshape(eqn.outvars[0].aval.shape))
-
-
-def _sliced(p: dict, places: np.ndarray) -> np.ndarray:
-    strides = p["strides"] or (1,) * places.ndim
-    return places[tuple(map(slice, p["start_indices"], p["limit_indices"], strides))]
-
-
-def _broadcast(p: dict, places: np.ndarray) -> np.ndarray:
-    new = [i for i in range(len(p["shape"])) if i not in p["broadcast_dimensions"]]
-    return np.broadcast_to(np.expand_dims(places, new), p["shape"])
 
 
 def _split(build: Builder, eqn: core.JaxprEqn, x: Value) -> list[Value]:
@@ -191,25 +181,20 @@ RULES: dict[str, Rule] = {
     **rules_of_rows.RULES,
     **dict.fromkeys(OPERATIONS.keys() - {"lookup"}, _elementwise),
     "add_any": lambda build, eqn, x, y: build.map("add", x, y),
-    "broadcast_in_dim": _place(_broadcast),
+    "broadcast_in_dim": _place(constants.broadcast),
     "cholesky": _cholesky,
     "clamp": lambda build, eqn, low, x, high: build.map("min", build.map("max", x, low), high),
     "concatenate": lambda build, eqn, *xs: build.rows(np.concatenate, xs, eqn.params["dimension"]),
     "dynamic_slice": _dynamic_slice,
-    "expand_dims": _reshape,
     "gather": _gather,
     "optimization_barrier": lambda build, eqn, *xs: list(xs),
     "pad": _pad,
-    "reshape": _reshape,
+    **dict.fromkeys(("expand_dims", "reshape", "squeeze"), _reshape),
     "rev": _place(lambda p, places: np.flip(places, p["dimensions"])),
-    "scatter": _scatter,
-    "scatter-add": _scatter,
-    "scatter-mul": _scatter,
-    "slice": _place(_sliced),
+    **dict.fromkeys(("scatter", "scatter-add", "scatter-mul"), _scatter),
+    "slice": _place(constants.sliced),
     "split": _split,
-    "squeeze": _reshape,
     "stack": lambda build, eqn, *xs: build.rows(np.stack, xs, eqn.params["axis"]),
-    "stop_gradient": lambda build, eqn, x: x,
     "tile": _place(lambda p, places: np.tile(places, p.get("reps", p.get("repeats")))),
     "transpose": _place(lambda p, places: np.transpose(places, p["permutation"])),
     "triangular_solve": _solve,

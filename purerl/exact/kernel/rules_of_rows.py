@@ -65,17 +65,14 @@ def _dot(build: Builder, eqn: core.JaxprEqn, x: Value, y: Value) -> Value:
     return build.fold("add", build.map("mul", *terms), eqn.outvars[0].aval.shape)
 
 
-def _cumulative(op: str) -> Rule:
-    def rule(build: Builder, eqn: core.JaxprEqn, x: Value) -> Value:
-        axis, backwards = eqn.params["axis"], eqn.params["reverse"]
-        rows = list(np.moveaxis(x.places, axis, 0))
-        found: list[Value] = []
-        for row in rows[::-1] if backwards else rows:
-            term = build.take(x, row)
-            found.append(build.map(op, found[-1], term) if found else term)
-        return build.rows(np.stack, found[::-1] if backwards else found, axis)
-
-    return rule
+def _cumulative_sum(build: Builder, eqn: core.JaxprEqn, x: Value) -> Value:
+    axis, backwards = eqn.params["axis"], eqn.params["reverse"]
+    rows = list(np.moveaxis(x.places, axis, 0))
+    found: list[Value] = []
+    for row in rows[::-1] if backwards else rows:
+        term = build.take(x, row)
+        found.append(build.map("add", found[-1], term) if found else term)
+    return build.rows(np.stack, found[::-1] if backwards else found, axis)
 
 
 def _sort(build: Builder, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
@@ -126,9 +123,7 @@ def _order(build: Builder, keys: Sequence[Value]) -> Value:
 RULES: dict[str, Rule] = {
     "argmax": _first_of("max"),
     "argmin": _first_of("min"),
-    "cummax": _cumulative("max"),
-    "cumprod": _cumulative("mul"),
-    "cumsum": _cumulative("add"),
+    "cumsum": _cumulative_sum,
     "dot_general": _dot,
     "reduce_and": _reduce("and"),
     "reduce_max": _reduce("max"),

@@ -38,21 +38,21 @@ class Text(NamedTuple):
 def written(program: Program) -> Text:
     """Returns the text of a kernel; NoRuleError if an environment needs too much memory."""
     scheduler = Scheduler(program)
-    placed = memory.placed(scheduler, program.inputs)
-    if placed.size > MOST_MEMORY:
+    address, size = memory.placed(scheduler, program.inputs)
+    if size > MOST_MEMORY:
         raise NoRuleError(
-            f"A kernel needs memory for {placed.size:,} numbers of each environment, and has room "
+            f"A kernel needs memory for {size:,} numbers of each environment, and has room "
             f"for {MOST_MEMORY:,}: leave this step to XLA."
         )
-    writer = _Writer(scheduler, placed)
+    writer = _Writer(scheduler, address)
     lines = list(writer.program(program))
     some = (program.inputs, program.outputs)
     sizes = [[(x.size, x.kind) for x in values if x.size] for values in some]
     places, constants = writer.tables.places, writer.tables.constants
     tables = [f"TABLE unsigned short T[] = {{{_numbers(places)}}};"]
     tables += [f"TABLE unsigned int C_[] = {{{_numbers(constants, 'u')}}};"]
-    body = "\n".join([f"#define MEMORY {placed.size}", "PRELUDE", *tables, *lines, ""])
-    return Text(body, placed.size, writer.statements, *(tuple(x) for x in sizes))
+    body = "\n".join([f"#define MEMORY {size}", "PRELUDE", *tables, *lines, ""])
+    return Text(body, size, writer.statements, *(tuple(x) for x in sizes))
 
 
 def _numbers(arrays: Sequence[np.ndarray], suffix: str = "") -> str:
@@ -62,8 +62,8 @@ def _numbers(arrays: Sequence[np.ndarray], suffix: str = "") -> str:
 class _Writer(Cells):
     """Writes one kernel."""
 
-    def __init__(self, scheduler: Scheduler, placed: memory.Memory):
-        super().__init__(placed.address)
+    def __init__(self, scheduler: Scheduler, address: dict[Value, int]):
+        super().__init__(address)
         self.scheduler, self.statements = scheduler, 0
 
     def program(self, program: Program) -> Iterator[str]:
