@@ -6,6 +6,7 @@ What belongs here: code that rewrites a traced function, and the choices of XLA 
 May import: nothing. Read: `rewriting.py` (the public function), `walk.py` (how a trace is run again
 with equations replaced), then the two sets of rules: `order.py` with `scatters.py`, the promise,
 and `fuse.py`, the optimisation. `portable.py` has the rules for a CPU. `xla_flags.py` stands alone.
+`kernel/` makes a function one kernel, and has its own README.
 """
 
 import purerl

@@ -1,4 +1,9 @@
 # The public names, each once; `__init__.py` reads this list.
+from purerl.exact.kernel.compiling import (
+    compile_kernel as compile_kernel,
+    kernel_agreement as kernel_agreement,
+    kernel_missing as kernel_missing,
+)
 from purerl.exact.order import (
     ScatterSum as ScatterSum,
     unordered_in as unordered_in,

@@ -66,7 +66,8 @@ def _compute(eqn: core.JaxprEqn, *values: np.ndarray) -> list[np.ndarray]:
 # --- a rule for each primitive: (parameters, *inputs) -> output ---
 
 
-def _broadcast(p: dict, x: np.ndarray) -> np.ndarray:
+def broadcast(p: dict, x: np.ndarray) -> np.ndarray:
+    """Returns what the primitive `broadcast_in_dim` makes of an array."""
     new = [i for i in range(len(p["shape"])) if i not in p["broadcast_dimensions"]]
     return np.broadcast_to(np.expand_dims(x, new), p["shape"])
 
@@ -99,7 +100,7 @@ _RULES: dict[str, Callable[..., np.ndarray]] = {
     name: lambda p, *values, function=function: function(*values)
     for name, function in _ELEMENTWISE.items()
 } | {
-    "broadcast_in_dim": _broadcast,
+    "broadcast_in_dim": broadcast,
     "concatenate": lambda p, *xs: np.concatenate(xs, p["dimension"]),
     "convert_element_type": lambda p, x: x.astype(p["new_dtype"]),
     "cumsum": _cumulative_sum,

@@ -27,7 +27,7 @@ def ordered_scatter(eqn: core.JaxprEqn, inputs: Sequence, inside: Inside) -> lis
             "Compute the indices of a sum from constants; of MJX, change the model or ask for "
             "fewer readings, so that it is not needed."
         )
-    touched, turns = _order_of_sums(_addresses(eqn, indices), updates.size)
+    touched, turns = order_of_sums(addresses(eqn, indices), updates.size)
     whole, flat = jnp.reshape(operand, (-1,)), jnp.reshape(updates, (-1,))
     if (turns == updates.size).any():
         flat = jnp.concatenate([flat, jnp.zeros(1, flat.dtype)])
@@ -60,12 +60,12 @@ def gathered_scatter(eqn: core.JaxprEqn, inputs: Sequence, inside: Inside) -> li
     operand, indices, updates = inputs
     if not is_known(indices):
         return None
-    addresses = _addresses(eqn, indices)
-    kept = np.flatnonzero(addresses >= 0)
+    found = addresses(eqn, indices)
+    kept = np.flatnonzero(found >= 0)
     if not kept.size:
         return [operand]
     place = np.full(operand.size, -1)
-    place[addresses[kept]] = kept
+    place[found[kept]] = kept
     put = jnp.reshape(_take(jnp.reshape(updates, (-1,)), np.maximum(place, 0)), operand.shape)
     return [jnp.where(np.reshape(place >= 0, operand.shape), put, operand)]
 
@@ -80,7 +80,7 @@ def _take(flat: Array, index: np.ndarray) -> Array:
     return lax.gather(flat, index, numbers, (1,), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
 
 
-def _addresses(eqn: core.JaxprEqn, indices: np.ndarray) -> np.ndarray:
+def addresses(eqn: core.JaxprEqn, indices: np.ndarray) -> np.ndarray:
     """Returns for each update the flat address it is added to; below 0 if it is dropped.
 
     This is XLA's definition of a scatter: each index vector says where a window of updates starts.
@@ -109,7 +109,7 @@ def _addresses(eqn: core.JaxprEqn, indices: np.ndarray) -> np.ndarray:
     return np.moveaxis(address, window_axes, d.update_window_dims).reshape(-1)
 
 
-def _order_of_sums(address: np.ndarray, none: int) -> tuple[np.ndarray, np.ndarray]:
+def order_of_sums(address: np.ndarray, none: int) -> tuple[np.ndarray, np.ndarray]:
     """Sorts updates by the address [updates] that they are added to; `none` stands for no update.
 
     Returns the addresses that receive an update, [touched], ascending; and for each the number of

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests import quick
+from tests.exact.kernel import needs_compiler
 
 ROOT = Path(__file__).parents[2]
 
@@ -17,6 +18,7 @@ def blocks(kind):
     return re.findall(rf"```{kind}\n(.*?)```", (ROOT / "docs/howto/exact.md").read_text(), re.S)
 
 
+@needs_compiler
 @pytest.mark.slow
 def test_the_pages_code_prints_what_the_page_says():
     program = "\n".join(blocks("python"))

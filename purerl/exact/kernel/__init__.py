@@ -1,0 +1,1 @@
+"""A traced function as one kernel: see README.md. Read: `compiling.py`, then `values.py`."""

@@ -1,0 +1,114 @@
+"""C for single numbers: of memory, of constants, and what is computed of them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from purerl.exact.kernel import indices, operations
+from purerl.exact.kernel.lanes import LANES
+from purerl.exact.kernel.statements import Code, Leaf, Line
+from purerl.exact.kernel.values import Const, Value, home
+
+TYPES = {"f": "float", "i": "int", "b": "int"}
+
+
+class Cells:
+    """The memory of an environment and the tables that all of them read, as C."""
+
+    def __init__(self, address: dict[Value, int]):
+        """Begins with empty tables.
+
+        Args:
+          address: where each value stands in memory, by its home.
+        """
+        self.address, self.tables = address, indices.Tables()
+
+    def memory(self, kind: str, place: str) -> str:
+        """Returns C for a number in memory."""
+        return f"{'P' if kind == 'f' else 'I'}[{place}]"
+
+    def addresses(self, leaf: Leaf) -> np.ndarray:
+        """Returns where the numbers of a leaf stand in memory."""
+        base = np.array([self.address[x] for x in leaf.sources])
+        return base[leaf.which] + leaf.at
+
+    def constant(self, numbers: np.ndarray, kind: str, place: str) -> str:
+        """Returns C for constants; `place` is C for which of them."""
+        first = numbers.flat[0]
+        if (numbers == first).all() or (numbers != numbers).all():
+            return _literal(first, kind)
+        return _of_table(kind, f"{self.tables.constant(numbers, kind)}+{place}")
+
+    def leaf(self, leaf: Leaf, number: str = "i") -> str:
+        """Returns C for a leaf [n] at a place."""
+        if not leaf.sources:
+            return self.constant(leaf.at, leaf.kind, number)
+        return self.memory(leaf.kind, indices.text(self.tables, self.addresses(leaf), number))
+
+    def term(self, leaf: Leaf, term: int | None) -> str:
+        """Returns C for a leaf [rows, terms] at row i, and at a term or, of None, at term j."""
+        if term is not None:
+            return self.leaf(leaf._replace(which=leaf.which[:, term], at=leaf.at[:, term]))
+        rows, terms = leaf.at.shape
+        if not leaf.sources:
+            return self.constant(np.ascontiguousarray(leaf.at.T), leaf.kind, f"{rows}*j+i")
+        at = self.addresses(leaf)
+        first, along = at[:, 0], at[0] - at[0, 0]
+        if (at == first[:, None] + along).all():
+            first, along = first + along.min(), along - along.min()
+            place = f"{indices.text(self.tables, first)}+{indices.text(self.tables, along, 'j')}"
+        else:
+            place = indices.text(self.tables, np.ascontiguousarray(at.T).reshape(-1), f"{rows}*j+i")
+        return self.memory(leaf.kind, place)
+
+    def code(self, code: Code, leaves: Sequence[str]) -> tuple[list[str], str]:
+        """Returns the lines that compute one number, given C for its leaves, and its name."""
+        lines = [f"{TYPES[x.kind]} l{i} = {text};"
+                 for i, (x, text) in enumerate(zip(code.leaves, leaves, strict=True))]  # fmt: skip
+        for number, line in enumerate(code.lines):
+            args = [_name(arg) for arg in line.args]
+            text = self.operation(code, line, args)
+            lines.append(f"{TYPES[line.kind]} t{number} = {text};")
+        return lines, _name(code.result)
+
+    def operation(self, code: Code, line: Line, args: list[str]) -> str:
+        """Returns C for a line, given C for its arguments."""
+        if line.op != "lookup":
+            return operations.text_of(line.op, line.kind, line.param, *args)
+        table = code.tables[line.param]
+        if isinstance(table, Const):
+            return _of_table(line.kind, f"{self.tables.constant(table.array, line.kind)}+{args[0]}")
+        return self.memory(line.kind, f"{self.address[home(table)]}+{args[0]}")
+
+    def assign(self, target: str, size: int, code: Code) -> str:
+        """Returns C that computes numbers and puts them where `target` says."""
+        lines, result = self.code(code, [self.leaf(leaf) for leaf in code.leaves])
+        return f"{each(size)} {{ {' '.join(lines)} {target} = {result}; }}"
+
+    def copy(self, value: Value, code: Code, size: int = 0) -> str:
+        """Returns C that computes numbers, by default a value's, and puts them where it stands."""
+        target = self.memory(value.kind, f"{self.address[value]}+i")
+        return self.assign(target, size or value.size, code)
+
+
+def each(size: int) -> str:
+    """Returns C that does something for each i."""
+    return f"EACH(i, {size})" if size > LANES else f"FEW(i, {size})"
+
+
+def _of_table(kind: str, place: str) -> str:
+    return f"C[{place}]" if kind == "f" else f"((int)C_[{place}])"
+
+
+def _name(number: int) -> str:
+    return f"t{number}" if number >= 0 else f"l{~number}"
+
+
+def _literal(number: float, kind: str) -> str:
+    if kind != "f":
+        return str(int(number))
+    if number != number:
+        return "NAN"
+    if np.isinf(number):
+        return "INFINITY" if number > 0 else "-INFINITY"
+    return f"{float(number)!r}f"

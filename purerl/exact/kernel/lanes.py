@@ -1,0 +1,55 @@
+"""Which sums the lanes of a warp share, and so the order of every sum.
+
+The order follows from the model alone: it is the same for any number of environments, on any
+device, and in the C++ of one lane.
+
+- A row of terms that the lanes share: lane l adds terms l, l + 32, l + 64, ... in this order; then
+  lanes l and l + 16 are added, l and l + 8, and so on down to l + 1.
+- Any other row, from its first term to its last.
+"""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from purerl.exact.kernel.values import Fold, Map, Value, View
+
+LANES = 32  # of a warp, which computes one environment
+FEW_ROWS = 16  # of a fold whose rows the lanes share; of more rows each has a lane
+WIDEST = 32  # a square of sums, such as a Hessian, is shared too, if it has no more columns
+
+
+def are_shared(fold: Fold) -> bool:
+    """Tells whether the lanes share the rows of a fold."""
+    return fold.terms >= LANES and (fold.size <= FEW_ROWS or fold.width > 0)
+
+
+def width_of(fold: Fold) -> int:
+    """Returns n if the rows are an [n, n] of sums of products that is symmetric, else 0."""
+    n = math.isqrt(fold.size)
+    products = isinstance(fold.arg, Map) and fold.arg.op == "mul" and fold.op == "add"
+    if not products or n * n != fold.size or not 1 < n <= WIDEST:
+        return 0
+    factors = list(_factors(fold.arg, np.arange(fold.arg.size)))
+    ids, index = (np.stack(parts, -1) for parts in zip(*factors, strict=True))
+    _, number = np.unique(ids, return_inverse=True)
+    factor = (number.reshape(ids.shape) * (1 << 32) + index).reshape(n, n, fold.terms, -1)
+    return n if (np.sort(factor) == np.sort(factor.swapaxes(0, 1))).all() else 0
+
+
+def _factors(value: Value, places: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yields the factors of a product at places: of each number the value that has it, and where.
+
+    A value is told by its id.
+    """
+    if isinstance(value, Map) and value.op == "mul":
+        for arg in value.args:
+            yield from _factors(arg, places)
+    elif isinstance(value, View) and len(value.sources) == 1:
+        yield from _factors(value.sources[0], value.index[places])
+    elif isinstance(value, View):
+        ids = np.array([id(source) for source in value.sources])
+        yield ids[value.which[places]], value.index[places]
+    else:
+        yield np.full(places.shape, id(value)), places

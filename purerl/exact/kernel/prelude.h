@@ -1,0 +1,239 @@
+// The words of a kernel's text. CUDA: a warp steps an environment, its lanes share each statement.
+// C++: one lane does all, and adds in the same order as the 32.
+//
+// No word asks lanes for a vote (__any_sync, __reduce_max_sync). On an H200 builds with votes both
+// as a loop's condition and as a branch's gave wrong numbers, the same each time, and nobody found
+// out why. Here every lane computes a condition from numbers that all of them read, and then takes
+// what lane 0 has found.
+
+#ifdef __CUDACC__
+
+#define INFINITY __int_as_float(0x7f800000)
+#define NAN __int_as_float(0x7fffffff)
+#define INT_MAX 2147483647
+#define INT_MIN (-INT_MAX - 1)
+#define TABLE __device__ const
+#define KERNEL extern "C" __global__ void __launch_bounds__(32 * ENVIRONMENTS, 1) kernel
+#define FUNCTION static __device__ __forceinline__
+#define ROUTINE static __device__ __noinline__
+#define EACH(i, n) _Pragma("unroll 1") for (int i = lane; i < (n); i += 32)
+#define FEW(i, n) if (const int i = lane; i < (n))
+#define ROUNDS(j, n) _Pragma("unroll 1") for (int j = 0; j < (n); ++j)
+#define SYNC __syncwarp()
+#define LOCKSTEP __syncthreads()
+#define UNIFORM(x) uniform(x)
+#define SUMS(type, n, start) type sums[n]; _Pragma("unroll") for (int k = 0; k < n; ++k) sums[k] = start;
+#define SUM(k) sums[k]
+#define PUT(join, n, used, memory, to, also) put<n, used>(sums, memory, to, also, lane, join());
+#define BEGIN \
+  const int lane = threadIdx.x & 31; \
+  const int asked = blockIdx.x * ENVIRONMENTS + threadIdx.x / 32; \
+  const bool there = asked < environments[0]; /* the last block's other warps keep step */ \
+  const size_t e = there ? asked : environments[0] - 1; \
+  extern __shared__ float memory_of_block[]; \
+  float* const P = memory_of_block + (threadIdx.x / 32) * MEMORY; \
+  int* const I = (int*)P; \
+  const float* const C = (const float*)C_;
+#define END
+
+FUNCTION int uniform(int x) {
+  int first = __shfl_sync(~0u, x, 0);
+  __syncwarp();  // all have read before anything is written that the condition was made of
+  return first;
+}
+
+#else
+
+#include <climits>
+#include <cmath>
+#include <cstddef>
+#include <cstdlib>
+#define TABLE static const
+#define KERNEL extern "C" void kernel
+#define FUNCTION static inline
+#define ROUTINE static
+#define EACH(i, n) for (int i = 0; i < (n); ++i)
+#define FEW EACH
+#define ROUNDS EACH
+#define SYNC
+#define LOCKSTEP
+#define UNIFORM(x) (x)
+#define SUMS(type, n, start) type sums[n][32]; for (auto& row : sums) for (auto& x : row) x = start;
+#define SUM(k) sums[k][i & 31]
+#define PUT(join, n, used, memory, to, also) put<used>(sums, memory, to, also, join());
+#define BEGIN \
+  const int lane = 0; \
+  const bool there = true; \
+  static thread_local float P[MEMORY]; \
+  int* const I = (int*)P; \
+  const float* const C = (const float*)C_; \
+  (void)lane; (void)C; (void)I; \
+  for (size_t e = 0; e < (size_t)environments[0]; ++e) { \
+    for (float& x : P) x = NAN;  // what is read before it is written shows
+#define END }
+
+#endif
+
+FUNCTION float most(float a, float b) { return (a > b || a != a) ? a : b; }  // NaN before any number
+FUNCTION float least(float a, float b) { return (a < b || a != a) ? a : b; }
+FUNCTION int most(int a, int b) { return a > b ? a : b; }
+FUNCTION int least(int a, int b) { return a < b ? a : b; }
+FUNCTION float sign_of(float x) { return x > 0 ? 1.0f : x < 0 ? -1.0f : x; }
+FUNCTION int sign_of(int x) { return (x > 0) - (x < 0); }
+FUNCTION int rest_of(int x, int y) { return y == 0 ? x : y == -1 ? 0 : x % y; }
+FUNCTION int is_finite(float x) { return fabsf(x) < INFINITY; }
+
+#define JOINED_BY(name, text) \
+  struct joined_by_##name { \
+    template <class X> FUNCTION_OF_STRUCT X operator()(X a, X b) const { return text; } \
+  };
+#ifdef __CUDACC__
+#define FUNCTION_OF_STRUCT __device__ __forceinline__
+#else
+#define FUNCTION_OF_STRUCT
+#endif
+JOINED_BY(add, a + b)
+JOINED_BY(mul, a * b)
+JOINED_BY(max, most(a, b))
+JOINED_BY(min, least(a, b))
+JOINED_BY(and, a & b)
+JOINED_BY(or, a | b)
+
+#ifdef __CUDACC__
+
+// Joins what the lanes have of n sums: with lane l ^ 16 first, then l ^ 8, ... A step with more sums
+// than its distance halves them: one lane of a pair goes on with each. In the end lane l has sum l.
+template <int n, int far, class X, class Join>
+FUNCTION void joined(X* sums, int lane, Join join) {
+  if constexpr (n > far) {
+    const bool upper = lane & far;
+#pragma unroll
+    for (int k = 0; k < far; ++k) {
+      const X given = upper ? sums[k] : sums[k + far], kept = upper ? sums[k + far] : sums[k];
+      sums[k] = join(kept, __shfl_xor_sync(~0u, given, far));
+    }
+  } else {
+#pragma unroll
+    for (int k = 0; k < n; ++k) sums[k] = join(sums[k], __shfl_xor_sync(~0u, sums[k], far));
+  }
+  if constexpr (far > 1) joined<(n > far ? far : n), far / 2>(sums, lane, join);
+}
+template <int n, int used, class X, class Join>
+FUNCTION void put(
+    X* sums, X* memory, const unsigned short* to, const unsigned short* also, int lane, Join join) {
+#pragma unroll
+  for (int first = 0; first < n; first += 32) {
+    joined<(n < 32 ? n : 32), 16>(sums + first, lane, join);
+    if (lane < 32 && lane < used - first) {
+      memory[to[first + lane]] = sums[first];
+      memory[also[first + lane]] = sums[first];
+    }
+  }
+}
+
+#else
+
+template <int used, class X, class Join>
+FUNCTION void put(
+    X (*sums)[32], X* memory, const unsigned short* to, const unsigned short* also, Join join) {
+  for (int k = 0; k < used; ++k) {
+    X* lanes = sums[k];
+    for (int far = 16; far; far /= 2)
+      for (int l = 0; l < far; ++l) lanes[l] = join(lanes[l], lanes[l + far]);
+    memory[to[k]] = memory[also[k]] = lanes[0];
+  }
+}
+
+#endif
+
+// Column by column: the pivot's root, the column, then what it takes from the columns to the right.
+// A pivot that is not positive makes NaN of all that follows.
+FUNCTION float pivot_of(float x) { return x > 0 ? sqrtf(x) : NAN; }
+
+#ifdef __CUDACC__
+
+template <int n>
+ROUTINE void cholesky(float* A, int lane) {
+  if constexpr (n <= 32) {  // a row in the registers of each lane
+    const int r = lane < n ? lane : n - 1;
+    float row[n];
+#pragma unroll
+    for (int c = 0; c < n; ++c) row[c] = A[r * n + c];
+#pragma unroll
+    for (int j = 0; j < n; ++j) {
+      const float d = pivot_of(__shfl_sync(~0u, row[j], j));
+      row[j] = r == j ? d : row[j] / d;
+#pragma unroll
+      for (int c = j + 1; c < n; ++c) row[c] -= row[j] * __shfl_sync(~0u, row[j], c);
+    }
+    __syncwarp();
+    if (lane < n)
+#pragma unroll
+      for (int c = 0; c < n; ++c) A[r * n + c] = c <= r ? row[c] : 0.0f;
+  } else {
+    for (int j = 0; j < n; ++j) {
+      const float d = pivot_of(A[j * n + j]);
+      __syncwarp();
+      for (int r = j + lane; r < n; r += 32) A[r * n + j] = r == j ? d : A[r * n + j] / d;
+      __syncwarp();
+      for (int r = j + 1; r < n; ++r)
+        for (int c = j + 1 + lane; c <= r; c += 32) A[r * n + c] -= A[r * n + j] * A[c * n + j];
+      __syncwarp();
+    }
+    for (int k = lane; k < n * n; k += 32) if (k % n > k / n) A[k] = 0;
+  }
+}
+
+// Each x that is found is taken from the equations still to solve. Entry (r, k) of the matrix is
+// A[r * down + k * across].
+template <int n, int down, int across, int forward>
+ROUTINE void solve(const float* A, float* x, int lane) {
+  constexpr int rows = (n + 31) / 32;
+  float y[rows];
+#pragma unroll
+  for (int t = 0; t < rows; ++t) y[t] = lane + 32 * t < n ? x[lane + 32 * t] : 0.0f;
+#pragma unroll 1
+  for (int q = 0; q < n; ++q) {
+    const int k = forward ? q : n - 1 - q;
+    float mine = 0;
+#pragma unroll
+    for (int t = 0; t < rows; ++t)
+      if (k / 32 == t) {
+        if (lane == k % 32) y[t] /= A[k * (down + across)];
+        mine = y[t];
+      }
+    const float found = __shfl_sync(~0u, mine, k % 32);
+#pragma unroll
+    for (int t = 0; t < rows; ++t) {
+      const int r = lane + 32 * t;
+      if (r < n && (forward ? r > k : r < k)) y[t] -= A[r * down + k * across] * found;
+    }
+  }
+#pragma unroll
+  for (int t = 0; t < rows; ++t) if (lane + 32 * t < n) x[lane + 32 * t] = y[t];
+}
+
+#else
+
+template <int n>
+ROUTINE void cholesky(float* A, int) {
+  for (int j = 0; j < n; ++j) {
+    const float d = A[j * n + j] = pivot_of(A[j * n + j]);
+    for (int r = j + 1; r < n; ++r) A[r * n + j] /= d;
+    for (int r = j + 1; r < n; ++r)
+      for (int c = j + 1; c <= r; ++c) A[r * n + c] -= A[r * n + j] * A[c * n + j];
+    for (int c = j + 1; c < n; ++c) A[j * n + c] = 0;
+  }
+}
+
+template <int n, int down, int across, int forward>
+ROUTINE void solve(const float* A, float* x, int) {
+  for (int q = 0; q < n; ++q) {
+    const int k = forward ? q : n - 1 - q;
+    x[k] /= A[k * (down + across)];
+    for (int r = forward ? k + 1 : 0; r < (forward ? n : k); ++r)
+      x[r] -= A[r * down + k * across] * x[k];
+  }
+}
+
+#endif

@@ -1,0 +1,154 @@
+"""From a trace to the values of a kernel: loops, branches and calls; `rules.py` has the rest."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.extend import core
+
+from purerl.exact import constants, traces, walk
+from purerl.exact.kernel import values
+from purerl.exact.kernel.builder import Builder
+from purerl.exact.kernel.rules import RULES
+from purerl.exact.kernel.values import Block, Const, Held, NoRuleError, Value
+
+
+class Program(NamedTuple):
+    """A function of held values: what a kernel reads, and the values that it returns."""
+
+    block: Block
+    inputs: list[Held]
+    outputs: list[Value]
+
+
+class Missing(NamedTuple):
+    """What no kernel can compute, and where it was written."""
+
+    primitive: str
+    why: str  # "" if there is no rule at all
+    source: str  # file and line that traced it
+
+
+def read(closed: core.ClosedJaxpr) -> Program:
+    """Returns a trace as values; NoRuleError at the first equation that no kernel can compute."""
+
+    def refuse(found: Missing) -> None:
+        of = f" of {found.why}" if found.why else ""
+        raise NoRuleError(f"No kernel computes {found.primitive}{of}, traced at {found.source}.")
+
+    return _read(closed, refuse)
+
+
+def missing(closed: core.ClosedJaxpr) -> list[Missing]:
+    """Lists the equations of a trace that no kernel can compute, at any depth."""
+    found: dict[Missing, None] = {}
+    _read(closed, lambda one: found.update({one: None}))
+    return list(found)
+
+
+def _read(closed: core.ClosedJaxpr, refuse: Callable[[Missing], None]) -> Program:
+    reader = _Reader(refuse)
+    inputs = [reader.build.held(v.aval.shape, v.aval.dtype) for v in closed.jaxpr.invars]
+    return Program(reader.build.top, inputs, reader.run(closed, *inputs))
+
+
+class _Reader:
+    """Reads one trace; `refuse` is told what has no rule, and raises or not."""
+
+    def __init__(self, refuse: Callable[[Missing], None]):
+        self.build, self.refuse = Builder(), refuse
+
+    def run(self, closed: core.ClosedJaxpr, *args: Value) -> list[Value]:
+        """Returns a trace's results."""
+        return traces.evaluate(closed, self._equation, self.build.const, *args)
+
+    def _equation(self, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
+        name = eqn.primitive.name
+        if name in traces.CALLS:
+            return self.run(traces.sub_jaxprs(eqn)[0], *args)
+        try:
+            if name in _CONTROL:
+                return _CONTROL[name](self, eqn, *args)
+            if name in RULES:
+                found = RULES[name](self.build, eqn, *args)
+                return found if isinstance(found, list) else [found]
+            if all(isinstance(x, Const) for x in args):
+                with jax.ensure_compile_time_eval(), constants.on_cpu():
+                    arrays = [jax.device_put(x.array) for x in args]
+                    results = traces.bind_equation(eqn, *arrays)
+                return [self.build.const(np.asarray(x)) for x in results]
+            why = ""
+        except NoRuleError as error:
+            why = str(error)
+        self.refuse(Missing(name, why, traces.source(eqn)))
+        return [self._unknown(v.aval) for v in eqn.outvars]
+
+    def _unknown(self, aval: Any) -> Held:
+        """Returns what stands for a result that has no rule, while all of these are listed."""
+        kinds = {"b": np.bool_, "f": np.float32}
+        return self.build.held(aval.shape, kinds.get(np.dtype(aval.dtype).kind, np.int32))
+
+    def _round(self, role: str, carry: Sequence[Held], closed: Any, consts: Any) -> tuple:
+        """Returns a block that runs a trace on the carry, and its results."""
+        with self.build.inside(role) as block:
+            names = [Held(x.shape, x.kind, block, x) for x in carry]
+            return block, self.run(closed, *consts, *names)
+
+    def _carry(self, starts: Sequence[Value]) -> list[Held]:
+        return [Held(x.shape, x.kind, self.build.blocks[-1]) for x in starts]
+
+
+def _while(reader: _Reader, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
+    p = eqn.params
+    if p["cond_jaxpr"].out_avals[0].shape:
+        raise NoRuleError("a vmapped loop")
+    n, m = p["cond_nconsts"], p["body_nconsts"]
+    carry = reader._carry(args[n + m :])
+    test, (going,) = reader._round("while", carry, p["cond_jaxpr"], args[:n])
+    body, results = reader._round("while", carry, p["body_jaxpr"], args[n : n + m])
+    here, starts = reader.build.blocks[-1], list(args[n + m :])
+    return [*reader.build.step(values.Loop(here, starts, carry, body, results, None, test, going))]
+
+
+def _scan(reader: _Reader, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
+    p = eqn.params
+    n, m = walk.scan_sizes(p)
+    if len(args) > n + m or len(eqn.outvars) > m:
+        return _written_out(reader, p, args, n, m)
+    carry = reader._carry(args[n:])
+    body, results = reader._round("scan", carry, p["jaxpr"], args[:n])
+    step = values.Loop(reader.build.blocks[-1], list(args[n:]), carry, body, results, p["length"])
+    return list(reader.build.step(step))
+
+
+def _written_out(reader: _Reader, p: dict, args: Sequence[Value], n: int, m: int) -> list[Value]:
+    """A scan that reads or writes a row in each round: all rounds, one after another."""
+    build, rounds = reader.build, range(p["length"])
+    carry, rows = list(args[n : n + m]), []
+    for number in reversed(rounds) if p["reverse"] else rounds:
+        xs = [build.take(x, x.places[number]) for x in args[n + m :]]
+        results = reader.run(p["jaxpr"], *args[:n], *carry, *xs)
+        carry = results[:m]
+        rows.append(results[m:])
+    ordered = zip(*(rows[::-1] if p["reverse"] else rows), strict=True)
+    return [*carry, *(build.rows(np.stack, row, 0) for row in ordered)]
+
+
+def _cond(reader: _Reader, eqn: core.JaxprEqn, which: Value, *args: Value) -> list[Value]:
+    branches = eqn.params["branches"]
+    if isinstance(which, Const):
+        number = min(max(int(which.array), 0), len(branches) - 1)
+        return reader.run(branches[number], *args)
+    blocks, results = [], []
+    for branch in branches:
+        with reader.build.inside("branch") as block:
+            results.append(reader.run(branch, *args))
+        blocks.append(block)
+    writes = [reader.build.held(v.aval.shape, v.aval.dtype) for v in eqn.outvars]
+    chosen = reader.build.map("convert_element_type", which, kind="i")
+    step = values.Choice(reader.build.blocks[-1], [chosen], writes, blocks, results)
+    return list(reader.build.step(step))
+
+
+_CONTROL: dict[str, Callable[..., list[Value]]] = {"cond": _cond, "scan": _scan, "while": _while}

@@ -1,0 +1,251 @@
+"""Statements as C++ that is also CUDA: `prelude.h` has the words in which the two differ."""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from purerl.exact.kernel import memory, operations
+from purerl.exact.kernel.cells import TYPES, Cells, each
+from purerl.exact.kernel.lanes import LANES
+from purerl.exact.kernel.reading import Program
+from purerl.exact.kernel.schedule import Scheduler
+from purerl.exact.kernel.statements import Code, Plan, Statement, StepStatement
+from purerl.exact.kernel.values import Choice, Fold, Linear, Loop, NoRuleError, Value, home
+
+# What follows is of the fastest build on an H200 (lab/2026-11-29-one-kernel-on-a-cpu.md).
+LOCKSTEP = 4  # levels from one barrier of a block to the next: its warps share fetched code
+FEW_TERMS = 20  # a row of no more is written out, one of more is a loop
+AT_ONCE = 128  # results that lanes sum in one loop: each takes a register
+MOST_MEMORY = 1 << 16  # numbers: their places are kept in 16 bits
+
+
+class Text(NamedTuple):
+    """A kernel as text, and what its launch has to know."""
+
+    body: str  # without the prelude
+    memory: int  # numbers of 4 bytes for each environment
+    statements: int
+    inputs: tuple[tuple[int, str], ...]  # size and kind of each that is not empty
+    outputs: tuple[tuple[int, str], ...]
+
+    def __repr__(self) -> str:
+        """Says how long it is: it stands in traces."""
+        return f"{self.statements} statements"
+
+
+def written(program: Program) -> Text:
+    """Returns the text of a kernel; NoRuleError if an environment needs too much memory."""
+    scheduler = Scheduler(program)
+    address, size = memory.placed(scheduler, program.inputs)
+    if size > MOST_MEMORY:
+        raise NoRuleError(
+            f"A kernel needs memory for {size:,} numbers of each environment, and has room "
+            f"for {MOST_MEMORY:,}: leave this step to XLA."
+        )
+    writer = _Writer(scheduler, address)
+    lines = list(writer.program(program))
+    some = (program.inputs, program.outputs)
+    sizes = [[(x.size, x.kind) for x in values if x.size] for values in some]
+    places, constants = writer.tables.places, writer.tables.constants
+    tables = [f"TABLE unsigned short T[] = {{{_numbers(places)}}};"]
+    tables += [f"TABLE unsigned int C_[] = {{{_numbers(constants, 'u')}}};"]
+    body = "\n".join([f"#define MEMORY {size}", "PRELUDE", *tables, *lines, ""])
+    return Text(body, size, writer.statements, *(tuple(x) for x in sizes))
+
+
+def _numbers(arrays: Sequence[np.ndarray], suffix: str = "") -> str:
+    return ",".join(f"{x}{suffix}" for array in arrays for x in array) or "0"
+
+
+class _Writer(Cells):
+    """Writes one kernel."""
+
+    def __init__(self, scheduler: Scheduler, address: dict[Value, int]):
+        super().__init__(address)
+        self.scheduler, self.statements = scheduler, 0
+
+    def program(self, program: Program) -> Iterator[str]:
+        """Yields the kernel: inputs are copied to memory, and results to the caller's arrays."""
+        inputs = [x for x in program.inputs if x.size]
+        outputs = [x for x in self.scheduler.outputs if x.size]
+        words = [f"const {TYPES[x.kind]}* in{i}" for i, x in enumerate(inputs)]
+        words += [f"{TYPES[x.kind]}* out{i}" for i, x in enumerate(outputs)]
+        yield f"KERNEL(const int* environments, {', '.join(words)}) {{\nBEGIN"
+        for number, value in enumerate(inputs):
+            to = self.memory(value.kind, f"{self.address[value]}+i")
+            yield f"{each(value.size)} {to} = in{number}[e*{value.size}+i];"
+        lines = list(self._plan(self.scheduler.plan, copied=False))
+        if self.scheduler.slots:
+            slots = np.array(list(self.scheduler.slots), np.uint32).view(np.int32)
+            at = self.tables.constant(slots, "i")
+            yield f"{each(len(slots))} I[i] = (int)C_[{at}+i];"
+        yield "SYNC;"
+        yield from lines
+        names: dict[Value, str] = {x: f"out{i}[e*{x.size}+i]" for i, x in enumerate(outputs)}
+        yield "if (there) {"
+        for target, code in self.scheduler.plan.copies:
+            yield self.assign(names[target], target.size, code)
+        yield "}\nEND }"
+
+    # --- statements ---
+
+    def _plan(self, plan: Plan, copied: bool = True) -> Iterator[str]:
+        for number, level in enumerate(plan.levels):
+            if plan.in_step and number % LOCKSTEP == 0:
+                yield "LOCKSTEP;"
+            plain = [x for x in level if isinstance(x, Statement)]
+            shared = sorted((x for x in plain if x.shared), key=_shape)
+            for _, some in itertools.groupby(shared, _shape):
+                yield from self._shared(list(some))
+            for statement in plain:
+                if not statement.shared:
+                    yield (
+                        self._fold(statement)
+                        if statement.fold
+                        else self.copy(statement.writes[0], statement.code, statement.size)
+                    )
+            for step in level:
+                if isinstance(step, StepStatement):
+                    yield from self._step(step)
+            yield "SYNC;"
+            self.statements += len(level)
+        if copied and plan.copies:
+            yield from (self.copy(value, code) for value, code in plan.copies)
+            yield "SYNC;"
+
+    def _fold(self, statement: Statement) -> str:
+        """Each lane makes a row one number, from its first term to its last."""
+        first, code, terms = statement.writes[0], statement.code, statement.terms
+        join = lambda x: operations.text_of(statement.fold, first.kind, None, "sum", x)  # noqa: E731
+        if terms <= FEW_TERMS:
+            body = [f"{TYPES[first.kind]} sum;"]
+            for term in range(terms):
+                lines, result = self.code(code, [self.term(leaf, term) for leaf in code.leaves])
+                body.append(f"{{ {' '.join(lines)} sum = {join(result) if term else result}; }}")
+        else:
+            lines, result = self.code(code, [self.term(leaf, None) for leaf in code.leaves])
+            start = operations.neutral(statement.fold, first.kind)
+            body = [f"{TYPES[first.kind]} sum = {start};", f"ROUNDS(j, {terms}) {{", *lines]
+            body += [f"sum = {join(result)};", "}"]
+        target = self.memory(first.kind, f"{self.address[first]}+i")
+        return f"{each(statement.size)} {{ {' '.join(body)} {target} = sum; }}"
+
+    def _shared(self, statements: list[Statement]) -> Iterator[str]:
+        """The lanes share each row. Rows of equal length are in one loop, and read once."""
+        fold, terms, kind = _shape(statements[0])
+        rows = [(x, row) for x in statements for row in _distinct_rows(x)]
+        for start in range(0, len(rows), AT_ONCE):
+            some = rows[start : start + AT_ONCE]
+            body: dict[str, str] = {}  # C -> its name
+            sums = []
+            for number, (statement, row) in enumerate(some):
+                result = self._row(statement.code, row, body)
+                text = operations.text_of(fold, kind, None, f"SUM({number})", result)
+                sums.append(f"SUM({number}) = {text};")
+            lines = [f"auto {name} = {text};" for text, name in body.items()]
+            count, neutral = _padded(len(some)), operations.neutral(fold, kind)
+            yield f"{{ SUMS({TYPES[kind]}, {count}, {neutral})"
+            yield f"EACH(i, {terms}) {{ {' '.join(lines + sums)} }}"
+            to, also = (self.tables.place(x) for x in self._targets(some))
+            memory = "P" if kind == "f" else "I"
+            yield f"PUT(joined_by_{fold}, {count}, {len(some)}, {memory}, T+{to}, T+{also}) }}"
+
+    def _row(self, code: Code, row: int, known: dict[str, str]) -> str:
+        """Adds the lines for a term of one row to those known; returns the name of the term."""
+
+        def name(text: str) -> str:
+            return known.setdefault(text, f"v{len(known)}")
+
+        leaves = [x._replace(which=x.which[row], at=x.at[row]) for x in code.leaves]
+        names = [name(self.leaf(leaf)) for leaf in leaves]
+        results: list[str] = []
+        for line in code.lines:
+            args = [names[~arg] if arg < 0 else results[arg] for arg in line.args]
+            results.append(name(self.operation(code, line, args)))
+        return names[~code.result] if code.result < 0 else results[code.result]
+
+    def _targets(self, rows: Sequence[tuple[Statement, int]]) -> tuple[np.ndarray, np.ndarray]:
+        """Returns where each row's result is put, and where a second time: see `_distinct_rows`."""
+        first = [self.address[statement.writes[0]] for statement, _ in rows]
+        to = np.array([row for _, row in rows])
+        also = [_mirrored(statement, row) for statement, row in rows]
+        return np.array(first) + to, np.array(first) + np.array(also)
+
+    # --- steps ---
+
+    def _step(self, statement: StepStatement) -> Iterator[str]:
+        yield from (self.copy(value, code) for value, code in statement.copies)
+        yield "SYNC;"
+        step = statement.step
+        if isinstance(step, Linear):
+            yield self._linear(step)
+        elif isinstance(step, Choice):
+            yield from self._choice(statement)
+        else:
+            assert isinstance(step, Loop)
+            yield from self._loop(step, statement.plans)
+
+    def _loop(self, step: Loop, plans: Sequence[Plan]) -> Iterator[str]:
+        if step.rounds is not None:
+            yield f"ROUNDS(round{step.inner.depth}, {step.rounds}) {{"
+        else:
+            yield "for (;;) {"
+            yield from self._plan(plans[0])
+            assert plans[0].test
+            yield f"{self._uniform(plans[0].test)} if (!which) break;"
+        yield from self._plan(plans[-1])
+        yield "}"
+
+    def _choice(self, statement: StepStatement) -> Iterator[str]:
+        assert statement.which
+        yield f"{{ {self._uniform(statement.which)}"
+        last = len(statement.plans) - 1
+        for number, plan in enumerate(statement.plans):
+            test = f"if (which <= {number})" if number < last else ""
+            yield f"{'else ' if number else ''}{test} {{"
+            yield from self._plan(plan)
+            yield "}"
+        yield "}"
+
+    def _uniform(self, code: Code) -> str:
+        """Returns C that sets `which` to one number, the same in all lanes: see UNIFORM."""
+        lines, result = self.code(code, [self.leaf(leaf, "0") for leaf in code.leaves])
+        return f"int which; {{ {' '.join(lines)} which = UNIFORM({result}); }}"
+
+    def _linear(self, step: Linear) -> str:
+        (target,), n = step.writes, step.reads[0].shape[0]
+        to = self.address[home(target)]
+        if step.op == "cholesky":
+            return f"cholesky<{n}>(P + {to}, lane);"
+        matrix = self.address[home(step.reads[0])]
+        steps = f"1, {n}" if step.transposed else f"{n}, 1"
+        forward = int(step.lower != step.transposed)
+        return f"solve<{n}, {steps}, {forward}>(P + {matrix}, P + {to}, lane);"
+
+
+def _shape(statement: Statement) -> tuple[str, int, str]:
+    return statement.fold, statement.terms, statement.writes[0].kind
+
+
+def _width(statement: Statement) -> int:
+    """Returns n if a shared fold's rows are a symmetric [n, n], else 0."""
+    (fold,) = statement.writes
+    return fold.width if isinstance(fold, Fold) else 0
+
+
+def _distinct_rows(statement: Statement) -> list[int]:
+    """Returns the rows to sum: of a symmetric square those of its lower half."""
+    n = _width(statement)
+    return [r * n + c for r in range(n) for c in range(r + 1)] or list(range(statement.size))
+
+
+def _mirrored(statement: Statement, row: int) -> int:
+    n = _width(statement)
+    return row % n * n + row // n if n else row
+
+
+def _padded(number: int) -> int:
+    """Returns how many results lanes sum: a power of 2, or a multiple of LANES; see `put`."""
+    return 1 << (number - 1).bit_length() if number < LANES else -(-number // LANES) * LANES

@@ -1,0 +1,118 @@
+"""Where and when values are computed: levels, memory, what is computed before a loop."""
+
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from purerl import exact
+from purerl.exact.kernel import levels, memory, reading, schedule, statements, values
+
+X = np.ones(9, np.float32)
+
+
+def statement(size, *needs, waits=True):
+    value = values.Held((size,), "f", values.Block("top"))
+    reads = {x for need in needs for x in need.writes}
+    return types.SimpleNamespace(writes=[value], reads=lambda: reads, waits=waits)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_statement_comes_after_all_that_it_reads(seed):
+    rng, made = np.random.default_rng(seed), []
+    for _ in range(30):
+        needs = rng.choice(len(made), min(len(made), int(rng.integers(3))), replace=False)
+        made.append(
+            statement(int(rng.integers(1, 50)), *(made[i] for i in needs), waits=rng.random() < 0.8)
+        )
+    level_of = {}
+    found = levels.levels_of(made, set(made[3].writes))
+    for number, level in enumerate(found):
+        level_of |= {x.writes[0]: number for x in level}
+    assert len(level_of) == len(made) and all(found)
+    assert all(level_of[x] < level_of[s.writes[0]] for s in made for x in s.reads())
+
+
+def test_large_values_that_can_wait_do():
+    small = [statement(1)]
+    for _ in range(4):
+        small.append(statement(1, small[-1]))
+    waits, other = statement(100, small[0]), statement(100, small[0], waits=False)
+    reader, last = statement(1, other, waits=False), statement(1, small[-1], waits)
+    found = levels.levels_of([*small, waits, other, reader, last], set())
+    assert other in found[1] and waits in found[4] and last in found[5]
+
+
+def looping(x):
+    y, z = jnp.sin(x), jnp.cos(x)
+
+    def body(_, c):
+        a = jnp.sort(c[0] + y)
+        return jnp.sort(jnp.sort(a[::-1] * a) + a.sum()) * 0.1, c[1]
+
+    return lax.fori_loop(0, 3, body, (x, z))
+
+
+def planned(function, *example):
+    program = reading.read(jax.make_jaxpr(function)(*example))
+    scheduler = schedule.Scheduler(program)
+    clock = memory._Clock()
+    for value in program.inputs:
+        clock.write([value])
+    clock.run(scheduler.plan)
+    return program, scheduler, clock
+
+
+def test_a_loop_needs_what_it_reads_and_carries_until_it_ends():
+    _, scheduler, clock = planned(looping, X)
+    every = [x for level in scheduler.plan.levels for x in level]
+    (loop,) = [x for x in every if isinstance(x, statements.StepStatement)]
+    inner = [x for plan in loop.plans for level in plan.levels for s in level for x in s.writes]
+    assert len(inner) > 5 and len(loop.plans[-1].outside) > 1
+    for value in {*loop.plans[-1].outside, *loop.writes}:
+        assert clock.first[value] < min(clock.first[x] for x in inner)
+        assert clock.last[value] > max(clock.last[x] for x in inner)
+
+
+def test_values_that_are_needed_at_once_do_not_share_memory():
+    program, scheduler, clock = planned(looping, X)
+    address, size = memory.placed(scheduler, program.inputs)
+    spans = clock.spans()
+    for i, one in enumerate(spans):
+        at = address[one.values[0]]
+        assert len(scheduler.slots) <= at and at + one.size <= size
+        for other in spans[:i]:
+            there = address[other.values[0]]
+            apart = at + one.size <= there or there + other.size <= at
+            assert apart or one.last < other.first or other.last < one.first
+    assert size < sum(span.size for span in spans), "some memory is used again"
+
+
+def text_of(function):
+    return exact.compile_kernel(function, X).text.body
+
+
+def test_what_does_not_change_in_a_loop_is_computed_before_it():
+    text = text_of(lambda x: lax.fori_loop(0, 3, lambda i, c: c * jnp.sin(x), x))
+    assert text.index("sinf") < text.index("ROUNDS(")
+
+
+def test_a_branch_keeps_what_it_alone_computes():
+    text = text_of(lambda x: lax.cond(x[0] > 0, lambda: jnp.sin(x), lambda: x))
+    assert text.index("which <= 0") < text.index("sinf")
+
+
+def test_all_warps_of_a_block_wait_only_where_all_make_the_same_rounds():
+    def newton(x):
+        x = lax.while_loop(
+            lambda c: c.sum() > 1, lambda c: lax.fori_loop(0, 2, lambda _, d: d * 0.5, c), x
+        )
+        return lax.fori_loop(0, 3, lambda _, c: jnp.sin(c), x)
+
+    text = text_of(newton)
+    begin, end = text.index("for (;;)"), text.rindex("ROUNDS(")
+    assert "LOCKSTEP" not in text[begin:end].rsplit("}", 1)[0]
+    assert "LOCKSTEP" in text[:begin] and "LOCKSTEP" in text[end:]
