@@ -77,7 +77,8 @@ def test_the_package_starts_no_jax_and_names_what_it_has():
     lines += ["import purerl.exact.rewriting, purerl.exact.fuse", "print(callable(exact.rewrite))"]
     found = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True)
     assert found.stdout.split() == ["True", "True"], found.stderr
-    with pytest.raises(AttributeError, match="no name 'rewrit': write `from purerl.exact import rewrite`"):
+    told = "no name 'rewrit': write `from purerl.exact import rewrite`"
+    with pytest.raises(AttributeError, match=told):
         exact.rewrit  # noqa: B018
     assert all(getattr(exact, name) for name in exact.__all__)
 
