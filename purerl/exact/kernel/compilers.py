@@ -133,7 +133,7 @@ def _nvrtc() -> Any:
             return ctypes.CDLL(name)
         except OSError:
             continue
-    raise CompilerError("No NVRTC is found: pip install 'jax[cuda13]' brings it.")
+    raise CompilerError("No NVRTC is found: it is in the wheels that JAX's CUDA needs.")
 
 
 # --- what was compiled ---
