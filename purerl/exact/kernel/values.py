@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+# None of these has a `repr`: each names others, down to the first, and a traceback would never end.
 DTYPES = {"f": np.float32, "i": np.int32, "b": np.bool_}
 
 
@@ -18,7 +19,7 @@ class NoRuleError(NotImplementedError):
     """An equation that no kernel can compute; the message names its primitive and its line."""
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Block:
     """What runs together: the whole kernel, a loop's condition or body, or a branch."""
 
@@ -28,7 +29,7 @@ class Block:
     known: dict[Any, "Value"] = field(default_factory=dict)  # what is computed here, by its parts
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Value:
     """Numbers of one kind: "f" float32, "i" int32, "b" bool (in memory as int32)."""
 
@@ -47,7 +48,7 @@ class Value:
         return np.arange(self.size).reshape(self.shape)
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Const(Value):
     """Numbers that are known before the kernel runs."""
 
@@ -58,14 +59,14 @@ class Const(Value):
         return bool(self.array.size and (self.array == number).all())
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Held(Value):
     """Numbers that a step or the caller has put into memory."""
 
     home: "Held | None" = None  # the value whose memory this one names, if it is not its own
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class View(Value):
     """Numbers of other values: number i is `sources[which[i]][index[i]]`. Never of a view."""
 
@@ -74,7 +75,7 @@ class View(Value):
     index: np.ndarray
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Map(Value):
     """An operation of `operations.py` on the numbers at one place of each argument [size]."""
 
@@ -83,7 +84,7 @@ class Map(Value):
     param: Any = None  # of "lookup": the value to look up in
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Fold(Value):
     """Rows of terms, [size, terms], each row made one number: a sum, or a greatest."""
 
@@ -95,7 +96,7 @@ class Fold(Value):
     shared: bool = False
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Step:
     """What is no expression: it reads values, and writes held ones."""
 
@@ -104,7 +105,7 @@ class Step:
     writes: list[Held]
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Loop(Step):
     """Rounds of a body. `reads` are what `writes`, the carry, starts from."""
 
@@ -115,7 +116,7 @@ class Loop(Step):
     going: Value | None = None
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Choice(Step):
     """One branch of several: that with the number in `reads`, or the nearest there is."""
 
@@ -123,7 +124,7 @@ class Choice(Step):
     results: list[list[Value]]
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Linear(Step):
     """A Cholesky factor of [n, n], or the solution of a triangular system, in place."""
 

@@ -50,10 +50,11 @@ def looping(x):
     y, z = jnp.sin(x), jnp.cos(x)
 
     def body(_, c):
-        a = jnp.sort(c[0] + y)
-        return jnp.sort(jnp.sort(a[::-1] * a) + a.sum()) * 0.1, c[1]
+        early = jnp.sort(c[1])
+        a = jnp.sort(c[0] + y + early)
+        return jnp.sort(jnp.sort(a[::-1] * a) + a.sum()) * 0.1, early
 
-    return lax.fori_loop(0, 3, body, (x, z))
+    return lax.fori_loop(0, 3, body, (x, z))[0]  # the rest of the carry is read in the loop alone
 
 
 def planned(function, *example):
@@ -89,6 +90,12 @@ def test_values_that_are_needed_at_once_do_not_share_memory():
             apart = at + one.size <= there or there + other.size <= at
             assert apart or one.last < other.first or other.last < one.first
     assert size < sum(span.size for span in spans), "some memory is used again"
+
+
+def test_what_is_read_and_what_is_written_in_one_level_do_not_share_memory():
+    times = [(0, 2), (2, 3), (3, 4)]
+    spans = [memory._Span([], 4, *when) for when in times]
+    assert memory._first_fit(spans, np.arange(3), 1) == (9, [1, 5, 1])
 
 
 def text_of(function):
