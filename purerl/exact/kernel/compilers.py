@@ -158,8 +158,9 @@ def _kept(whole: str, words: tuple[str, ...], kind: str, make: Callable[[str], b
 
 
 def _folder() -> Path:
-    cache = jax.config.jax_compilation_cache_dir
-    return Path(cache) / "kernels" if cache else Path(_of_this_process().name)
+    # Before "://" may stand who reads it. What then is no absolute path is of no folder here.
+    cache = Path((jax.config.jax_compilation_cache_dir or "").rpartition("://")[2])
+    return cache / "kernels" if cache.is_absolute() else Path(_of_this_process().name)
 
 
 @functools.cache

@@ -1,5 +1,7 @@
 """A kernel as an operation of JAX: batches, what a GPU's program says, what is kept on the disk."""
 
+import types
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -143,3 +145,14 @@ def test_a_kernel_has_no_derivative(kernel):
         NotImplementedError, match="ifferentiation rule for 'kernel' not implemented"
     ):
         jax.jvp(lambda y: kernel(EXAMPLE[0], y)["a"], (jnp.ones(4),), (jnp.ones(4),))
+
+
+@pytest.mark.parametrize(
+    ("cache", "kept"),
+    [("/a/b", True), ("purerl-checked:///a/b", True), ("gs://a/b", False), (None, False)],
+)
+def test_kernels_are_kept_in_the_cache_of_this_machine_alone(monkeypatch, cache, kept):
+    config = types.SimpleNamespace(jax_compilation_cache_dir=cache)
+    monkeypatch.setattr(compilers, "jax", types.SimpleNamespace(config=config))
+    assert (str(compilers._folder()) == "/a/b/kernels") == kept
+    assert compilers._folder().is_absolute()
