@@ -59,12 +59,13 @@ def tethered(spec: mujoco.MjSpec, joints: Sequence[str], kept: Sequence[str]) ->
     Args:
       spec: the body.
       joints: names of the joints that stay.
-      kept: names of the actuators that stay; none of their tendons may go over another joint.
+      kept: names of the actuators that stay, as do the tendons that they pull.
     """
-    of_joints = () if kept is not joints else spec.tendons
-    others = (*spec.sensors, *spec.keys, *spec.equalities, *spec.excludes, *of_joints)
-    actuators = [x for x in spec.actuators if x.name not in kept]
-    for one in [*others, *actuators, *(x for x in spec.joints if x.name not in joints)]:
+    pulled = {x.target for x in spec.actuators if x.name in kept}
+    gone = [*spec.sensors, *spec.keys, *spec.equalities, *spec.excludes]
+    gone += [x for x in spec.actuators if x.name not in kept]
+    gone += [x for x in spec.tendons if x.name not in pulled]
+    for one in [*gone, *(x for x in spec.joints if x.name not in joints)]:
         spec.delete(one)
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
