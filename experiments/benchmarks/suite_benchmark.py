@@ -172,9 +172,7 @@ def report(seeds: Sequence[suite_scores.Seed], out: Path) -> None:
         print(" ".join([f"{row[0]:24}", *(f"{cell!s:>12}" for cell in row[1:])]))
     print(suite_pictures.summary(tasks))
     for column in suite_scores.SHOWN:
-        above, below = suite_scores.ahead(tasks, published, column)
-        short = f"; short: {', '.join(below)}" if below else ""
-        print(f"at or above {column}: {len(above)} of {len(above) + len(below)}{short}")
+        print(suite_scores.told(column, *suite_scores.ahead(tasks, published, column)))
     print(*suite_clock.verdicts(tasks, by_time), sep="\n")
     suite_pictures.draw_tasks(out / "tasks_over_steps.png", tasks, published, {}, "steps")
     suite_pictures.draw_tasks(out / "tasks_over_seconds.png", tasks, {}, by_time, "seconds")

@@ -7,13 +7,13 @@ beginning of the command, so importing and compiling are in them.
 """
 
 import csv
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from purerl.experiments.benchmarks.suite_scores import Seed
+from purerl.experiments.benchmarks.suite_scores import Seed, parted, told
 from purerl.report import bootstrap
 
 REFERENCES = Path(__file__).parent / "suite_reference_time.csv"
@@ -52,6 +52,7 @@ def table(tasks: dict[str, list[Seed]], published: Published) -> list[list[Any]]
     head = [f"{name}_{second}" for name in ("purerl", "lowest", *who) for second in TIMES]
     rows: list[list[Any]] = [["task", "n", "machine", "start", *head]]
     for task, seeds in tasks.items():
+        returns = scores(seeds)
         starts = [s.start for s in seeds if s.start is not None]
         theirs = [published.get(task, {}).get(name, [None] * len(TIMES)) for name in who]
         rows.append(
@@ -60,8 +61,8 @@ def table(tasks: dict[str, list[Seed]], published: Published) -> list[list[Any]]
                 len(seeds),
                 " and ".join(sorted({s.machine for s in seeds} - {""})),
                 round(float(np.mean(starts)), 1) if starts else "",
-                *(round(float(bootstrap.interquartile_mean(x)), 1) for x in scores(seeds)),
-                *(round(float(x.min()), 1) for x in scores(seeds)),
+                *(round(float(bootstrap.interquartile_mean(x)), 1) for x in returns),
+                *(round(float(x.min()), 1) for x in returns),
                 *("" if x is None else x for values in theirs for x in values),
             ]
         )
@@ -69,25 +70,11 @@ def table(tasks: dict[str, list[Seed]], published: Published) -> list[list[Any]]
 
 
 def verdicts(tasks: dict[str, list[Seed]], published: Published) -> Iterator[str]:
-    """Yields a line for each of the others and each time: how many tasks are at or above them.
-
-    Theirs are whole numbers, so the IQM is rounded for this too.
-    """
-    ours = {task: list(map(bootstrap.interquartile_mean, scores(x))) for task, x in tasks.items()}
+    """Yields a line for each of the others and each time: how many tasks are at or above them."""
     for name in names(published):
         for i, second in enumerate(TIMES):
-            theirs = {
-                task: published.get(task, {}).get(name, [None] * len(TIMES))[i] for task in ours
-            }
-            compared = {task: value for task, value in theirs.items() if value is not None}
-            short = [task for task, value in compared.items() if np.rint(ours[task][i]) < value]
-            if compared:
-                yield (
-                    f"at or above {name} after {second} s: {len(compared) - len(short)} of "
-                    f"{len(compared)}{_named(short)}"
-                )
-
-
-def _named(short: Iterable[str]) -> str:
-    listed = ", ".join(short)
-    return f"; short: {listed}" if listed else ""
+            found = {task: rows[name][i] for task, rows in published.items() if name in rows}
+            theirs = {task: value for task, value in found.items() if value is not None}
+            ours = {task: scores(seeds)[i] for task, seeds in tasks.items()}
+            if ours.keys() & theirs.keys():
+                yield told(f"{name} after {second} s", *parted(ours, theirs))

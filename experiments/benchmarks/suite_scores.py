@@ -8,7 +8,7 @@ PPO trained for 79 to 184 M steps, SAC for 5 to 26 M, REPPO for 200 M.
 
 import csv
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -191,15 +191,31 @@ def table(tasks: dict[str, list[Seed]], published: dict[str, dict[str, float]]) 
 def ahead(
     tasks: dict[str, list[Seed]], published: dict[str, dict[str, float]], column: str
 ) -> tuple[list[str], list[str]]:
-    """Returns the tasks whose IQM is at or above a published column, and those that fall short.
+    """Returns the tasks whose IQM is at or above a published column, and those that fall short."""
+    scores = dict(zip(tasks, strata(tasks), strict=True))
+    return parted(scores, {t: row[column] for t, row in published.items() if column in row})
+
+
+def parted(
+    scores: Mapping[str, np.ndarray], published: Mapping[str, float]
+) -> tuple[list[str], list[str]]:
+    """Returns which published tasks have an IQM of their scores [n] at or above it, and the others.
 
     What was published is whole numbers, so the IQM is rounded for this too: 999.7 is no less than
     a 1000 that may be 999.6.
     """
-    compared = [task for task in tasks if column in published.get(task, {})]
-    scores = dict(zip(tasks, map(bootstrap.interquartile_mean, strata(tasks)), strict=True))
-    reached = {task: bool(np.rint(scores[task]) >= published[task][column]) for task in compared}
-    return [t for t in compared if reached[t]], [t for t in compared if not reached[t]]
+    above: list[str] = []
+    below: list[str] = []
+    for task in scores.keys() & published.keys():
+        reached = np.rint(bootstrap.interquartile_mean(scores[task])) >= published[task]
+        (above if reached else below).append(task)
+    return sorted(above), sorted(below)
+
+
+def told(what: str, above: Sequence[str], below: Sequence[str]) -> str:
+    """Returns a line of what `parted` returned."""
+    short = f"; short: {', '.join(below)}" if below else ""
+    return f"at or above {what}: {len(above)} of {len(above) + len(below)}{short}"
 
 
 def common_curve(

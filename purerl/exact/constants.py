@@ -84,7 +84,8 @@ def _cumulative_sum(p: dict, x: np.ndarray) -> np.ndarray:
     return x.cumsum(p["axis"], x.dtype)
 
 
-def _remainder(p: dict, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def remainder(p: dict, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Returns what the primitive `rem` makes of integers."""
     # As in XLA: the result has the sign of the dividend, and is x for y = 0.
     return np.where(y == 0, x, np.fmod(x, np.where(y == 0, 1, y)))
 
@@ -105,7 +106,7 @@ _RULES: dict[str, Callable[..., np.ndarray]] = {
     "convert_element_type": lambda p, x: x.astype(p["new_dtype"]),
     "cumsum": _cumulative_sum,
     "iota": lambda p: np.indices(p["shape"], p["dtype"])[p["dimension"]],
-    "rem": _remainder,
+    "rem": remainder,
     "reshape": lambda p, x: x.reshape(p["new_sizes"]),
     "select_n": lambda p, which, *cases: np.choose(which.astype(np.int32), cases),
     "slice": sliced,

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from purerl.exact import constants
 from purerl.exact.kernel.values import DTYPES
 
 
@@ -30,7 +31,7 @@ def _convert(kind: str, param: Any) -> str:
 
 
 def _remainder(x: Any, y: Any) -> Any:
-    return np.fmod(x, y) if x.dtype.kind == "f" else np.fmod(x, np.where(y == 0, 1, y))
+    return np.fmod(x, y) if x.dtype.kind == "f" else constants.remainder({}, x, y)
 
 
 OPERATIONS = {
