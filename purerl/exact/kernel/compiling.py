@@ -20,7 +20,7 @@ class Kernel:
 
     text: text.Text
     shapes: Any  # of the results, a pytree
-    inputs: Any  # the arguments' pytree
+    inputs: tuple[Any, list]  # the arguments' pytree, and the shape of each leaf
 
     @property
     def source(self) -> str:
@@ -33,8 +33,8 @@ class Kernel:
         A loop of `vmap` makes of it one launch, with a warp for each environment.
         """
         leaves, tree = jax.tree.flatten(args)
-        if tree != self.inputs:
-            raise ValueError(f"The arguments are {tree}; the kernel is for {self.inputs}.")
+        if (given := (tree, [np.shape(x) for x in leaves])) != self.inputs:
+            raise ValueError(f"The arguments are {given}; the kernel is for {self.inputs}.")
         kinds = [launch.DTYPES[kind] for _, kind in self.text.inputs]
         some = [jnp.asarray(x) for x in leaves if np.size(x)]
         rows = [x.astype(kind).reshape(-1) for x, kind in zip(some, kinds, strict=True)]
@@ -82,8 +82,8 @@ def compile_kernel(f: Callable, *example: Any) -> Kernel:
     Raises:
       NoRuleError: the first equation that no kernel computes; `kernel_missing` lists them all.
     """
-    closed, tree, shapes = _traced(f, *example)
-    return Kernel(text.written(reading.read(closed)), shapes, tree)
+    closed, inputs, shapes = _traced(f, *example)
+    return Kernel(text.written(reading.read(closed)), shapes, inputs)
 
 
 def kernel_missing(f: Callable, *example: Any) -> list[Missing]:
@@ -95,7 +95,7 @@ def _traced(f: Callable, *example: Any) -> tuple[core.ClosedJaxpr, Any, Any]:
     leaves, tree = jax.tree.flatten(example)
     flat = lambda *leaves: f(*jax.tree.unflatten(tree, leaves))  # noqa: E731
     closed, shapes = jax.make_jaxpr(flat, return_shape=True)(*leaves)
-    return closed, tree, shapes
+    return closed, (tree, [np.shape(x) for x in leaves]), shapes
 
 
 def kernel_agreement(kernel: Kernel, f: Callable, *args: Any) -> Agreement:

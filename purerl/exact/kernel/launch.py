@@ -37,7 +37,6 @@ def _now(*arrays: Any, **params: Any) -> list[jax.Array]:
 @primitive.def_abstract_eval
 def _shapes(*avals: Any, text: Text) -> list[jax.core.ShapedArray]:
     batch = avals[0].shape[:-1]
-
     return [jax.core.ShapedArray((*batch, n), DTYPES[kind]) for n, kind in text.outputs]
 
 

@@ -30,7 +30,7 @@ def _convert(kind: str, param: Any) -> str:
     return {"f": "((float)({}))", "i": "((int)({}))", "b": "({} != 0)"}[kind]
 
 
-def _remainder(x: Any, y: Any) -> Any:
+def _remainder(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.fmod(x, y) if x.dtype.kind == "f" else constants.remainder({}, x, y)
 
 
@@ -48,9 +48,8 @@ OPERATIONS = {
     "logistic": Operation("(1.0f/(1.0f + expf(-{})))", lambda x: 1 / (1 + np.exp(-x)), 20),
     "atan2": Operation("atan2f({}, {})", np.arctan2, 40),
     "pow": Operation("powf({}, {})", np.power, 40),
-    "rem": Operation(
-        lambda kind, _: "fmodf({}, {})" if kind == "f" else "rest_of({}, {})", _remainder, 10
-    ),
+    "rem": Operation("rest_of({}, {})", _remainder, 10),
+    "round": Operation("rintf({})", np.round),
     "not": Operation(lambda kind, _: "(!{})" if kind == "b" else "(~{})", np.invert),
     "is_finite": Operation("is_finite({})", np.isfinite),
     "select_n": Operation("({0} ? {2} : {1})", lambda which, no, yes: np.where(which, yes, no)),
@@ -69,7 +68,6 @@ _SAME = "cbrt ceil cos cosh exp exp2 expm1 floor log log1p sin sinh tan tanh".sp
 _OTHERS = {"asin": "arcsin", "acos": "arccos", "atan": "arctan"}
 for _name, _numpy in (dict(zip(_SAME, _SAME, strict=True)) | _OTHERS).items():
     OPERATIONS[_name] = Operation(f"{_name}f({{}})", getattr(np, _numpy), 20)
-OPERATIONS["round"] = Operation("rintf({})", np.round)
 _NEUTRAL = {"add": "0", "mul": "1", "or": "0"}
 
 

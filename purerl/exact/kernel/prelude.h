@@ -80,6 +80,7 @@ FUNCTION int most(int a, int b) { return a > b ? a : b; }
 FUNCTION int least(int a, int b) { return a < b ? a : b; }
 FUNCTION float sign_of(float x) { return x > 0 ? 1.0f : x < 0 ? -1.0f : x; }
 FUNCTION int sign_of(int x) { return (x > 0) - (x < 0); }
+FUNCTION float rest_of(float x, float y) { return fmodf(x, y); }
 FUNCTION int rest_of(int x, int y) { return y == 0 ? x : y == -1 ? 0 : x % y; }
 FUNCTION int is_finite(float x) { return fabsf(x) < INFINITY; }
 

@@ -38,6 +38,12 @@ def test_it_is_called_as_the_function_is(kernel):
 
 
 @needs_compiler
+def test_arguments_of_other_shapes_are_refused(kernel):
+    longer = EXAMPLE[0], np.ones(5, np.float32)
+    with pytest.raises(ValueError, match=r"\(5,\).*the kernel is for .*\(4,\)"):
+        kernel(*longer)
+
+
 def test_vmap_makes_one_call_of_any_batch(kernel):
     x = {"n": np.arange(6, dtype=np.int32).reshape(2, 3), "of": np.ones((2, 3), np.float32)}
     y = np.random.default_rng(0).normal(size=(3, 4)).astype(np.float32)

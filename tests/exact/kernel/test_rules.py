@@ -9,7 +9,7 @@ import pytest
 from jax import lax
 
 from purerl import exact
-from purerl.exact.kernel import compiling
+from purerl.exact.kernel import compiling, operations
 from tests import quick
 from tests.exact.kernel import by_one_lane, by_warps, needs_compiler, rows
 
@@ -370,3 +370,8 @@ def test_what_a_kernel_cannot_hold_is_refused():
     looping = jax.vmap(lambda x: lax.while_loop(lambda y: y < 9, lambda y: y * 2, x))
     with pytest.raises(compiling.NoRuleError, match="a vmapped loop"):
         exact.compile_kernel(looping, np.ones(3, np.float32))
+
+
+def test_a_remainder_that_is_known_is_xlas_by_zero_too():
+    x, y = np.int32([7, -7, 5]), np.int32([0, 3, 2])
+    assert operations.computed("rem", "i", None, x, y).tolist() == [7, -1, 1]
