@@ -53,19 +53,14 @@ class RecordOptions(EpisodeOptions):
 
 def command(words: Sequence[str]) -> None:
     """Writes the file and tells what is in it."""
-    from purerl.report import asking, episode_arrays, lesions
+    from purerl.report import asking, episode_arrays
 
-    found, runs, words = subject.find_runs(words, PROG)
-    if len(runs) > 1:
-        raise UserError(f"{len(runs)} runs are given; record one at a time.")
-    experiment, options = subject.chosen(found, words, PROG, RecordOptions)
+    name, run, experiment, options = subject.one_run(words, PROG, RecordOptions)
     check_least(options, UserError, episodes=1)
     files.check_new(options.out)
     if options.clips or options.out.suffix in (".h5", ".hdf5"):
         command_errors.check_installed("h5py", "clips")
-    ((name, run),) = runs.items()
-    setup = asking.setup_of(experiment, run)
-    setup, state, _ = lesions.lesioned(setup, run.state, options.lesion, options.seed)
+    setup, state = asking.acting(run, experiment, options)
     arrays = episode_arrays.record(setup, state, options.seed, options.episodes)
     write(options, arrays, setup.env, {"run": name, "digest": run.digest})
     show(*(f"{name:32} {x.dtype} {list(x.shape)}" for name, x in arrays.items()), str(options.out))

@@ -2,21 +2,29 @@
 
 RUN is a run's folder, or a policy that comes with purerl, as `ant_gaps`, whose videos go to
 videos/ant_gaps/. RUN/videos/<update>.mp4 shows the deterministic policy in real time, in each
-episode's own geometry; <update>.png beside it shows 16 moments of it. No screen is needed.
+episode's own geometry; <update>.png beside it shows 16 moments of it. No screen is needed. Any
+option of the environment can be given, and a lesion, as to `ask`; the files are named after them:
+
+    python -m purerl.render ant_gaps --env.arena single_gap --env.gap-length 0.5 0.5
 """
 
 import re
 from dataclasses import dataclass
+from typing import Any
 
 from purerl.core.errors import UserError, check_least
-from purerl.experiment.command_line import main_of
-from purerl.experiment.options import PlayOptions
+from purerl.experiment.command_line import main_of_words
+from purerl.experiment.options import EpisodeOptions, Lesion
 from purerl.machine import command_errors, output
+from purerl.report.opengl import open_gl
+from purerl.tune import subject
+
+PROG = "python -m purerl.render"
 
 
 @dataclass(frozen=True)
-class RenderOptions(PlayOptions):
-    """Makes a video (mp4) and a contact sheet (PNG) of a run's policy, in RUN/videos/.
+class RenderOptions(EpisodeOptions):
+    """What a video shows: a mp4 and a contact sheet (PNG), in RUN/videos/.
 
     Those of a policy that comes with purerl go to videos/NAME/.
     """
@@ -29,29 +37,32 @@ class RenderOptions(PlayOptions):
     """At most so much of each episode [s]."""
     size: str = "640x480"
     """Width x height of a frame [pixels], both even."""
+    lesion: Lesion = Lesion()
 
 
-def command(options: RenderOptions) -> None:
+def command(words: list[str]) -> None:
     """Makes the video, and prints which files it made."""
-    output.show(*make(options))
-
-
-def make(options: RenderOptions) -> list[str]:
-    """Checks the options and makes the video; returns lines about it, the last ones its files."""
-    from purerl.report.opengl import open_gl
-
-    size = _parse_size(options.size)
-    check_least(options, UserError, episodes=1, seconds=0.1)
     # First of all: what follows imports mujoco, which looks for OpenGL itself.
-    open_gl(*size).free()
+    open_gl(16, 16).free()
+    output.show(*make(*subject.one_run(words, PROG, RenderOptions)[1:]))
 
+
+def make(run: Any, experiment: Any, options: RenderOptions) -> list[str]:
+    """Makes the video; returns lines about it, the last ones its files.
+
+    Args:
+      run: what `load` returned.
+      experiment: the run's own, or with another `env`.
+      options: the command's.
+    """
+    from purerl.report import asking
     from purerl.report.video import make_video
-    from purerl.runs.loaded_run import load
 
-    run = load(options.run, options.checkpoint, options.engine, options.trust)
+    check_least(options, UserError, episodes=1, seconds=0.1)
+    size, acting = _parse_size(options.size), asking.acting(run, experiment, options)
+    changes = asking.changes(run.experiment, experiment, options.lesion)
     output.say("Compiling and playing: for a large body that may take two minutes.")
-    about = (options.camera, options.episodes, options.seconds, size, options.seed)
-    path, lines = make_video(run, *about)
+    path, lines = make_video(run, acting, size, options, changes)
     return [*lines, str(path.with_suffix(".png")), str(path)]
 
 
@@ -66,7 +77,7 @@ def _parse_size(size: str) -> tuple[int, int]:
     return width, height
 
 
-main = main_of(RenderOptions, command, "python -m purerl.render")
+main = main_of_words(command, lambda words: subject.show_help(RenderOptions, __doc__, PROG, words))
 
 
 if __name__ == "__main__":

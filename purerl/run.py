@@ -20,7 +20,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from purerl import render
 from purerl.core.errors import SUCCESS, StoppedError, one_line
 from purerl.experiment import loading
 from purerl.experiment.command_line import main_of_words, read_experiment
@@ -65,18 +64,20 @@ def _train(words: Sequence[str]) -> None:
         from purerl.devices.processes import is_first
 
         if is_first():
-            shown = render.RenderOptions(run=folders[0], trust=True)
-            file = _attempt("video", _show_policy, shown)
+            file = _attempt("video", _show_policy, folders[0])
             if file and options.wandb != "off":
                 _attempt("video at W&B", loggers.log_video, options, folders[0], Path(file))
 
 
-def _show_policy(options: Any) -> str:
-    """Makes a video; returns its path.
+def _show_policy(folder: Path) -> str:
+    """Makes a video of a run's policy; returns its path.
 
     Training has ended, and nothing that cannot be printed is a failure of it.
     """
-    for line in (lines := render.make(options)):
+    from purerl import load, render
+
+    trained = load(folder, trust=True)
+    for line in (lines := render.make(trained, trained.experiment, render.RenderOptions())):
         output.say(line)
     return lines[-1]
 

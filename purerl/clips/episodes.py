@@ -2,7 +2,7 @@
 
 metadata                      attributes: whose episodes these are
 qpos_layout, qvel_layout      the joint of each number; actuator: the name of each action
-episodes/I                    attributes n_steps, total_reward, terminated
+episodes/I                    attributes n_steps, total_reward, terminated; of imitation its clip
 episodes/I/timesteps          [T, ...] qpos, qvel, action, reward, value, done, ...
     observations, task, metrics, memory
     activations/LAYER         what each layer returned; one with layers in it is LAYER/__call__
@@ -53,6 +53,8 @@ def write(path: Path, arrays: dict[str, np.ndarray], env: Any, **about: Any) -> 
             group = file.create_group(f"episodes/{i}/timesteps")
             total = {"total_reward": rows["reward"].sum(), "terminated": rows["terminated"].sum()}
             group.parent.attrs.update(total, n_steps=length)
+            if "task/clip" in rows and hasattr(env, "names"):
+                group.parent.attrs["clip"] = env.names[arrays["task/clip"][i, 0]]
             times = np.arange(length) * env.control_timestep
             scale(group, "time", rows.pop("time", times)).attrs["units"] = UNITS["time"]
             for name, x in rows.items():

@@ -25,6 +25,7 @@ from purerl.report import lesions
 from purerl.report.bootstrap import episode_interval, mean_interval
 from purerl.report.comparison import picture
 from purerl.report.run_reader import flatten
+from purerl.runs.manifest import differences
 
 Case = tuple[Any, Experiment, Lesion]  # a condition: the value of what varies, and all settings
 # What a run's episodes were like under one: "run", "seed", "value", "lesion", "strength", "units";
@@ -109,6 +110,21 @@ def setup_of(experiment: Experiment, run: Any) -> Setup:
     learned = jax.eval_shape(run.env.reset, jax.random.key(0)).observation
     check_observation(setup.env, learned)
     return setup
+
+
+def acting(run: Any, experiment: Experiment, options: Any) -> tuple[Setup, TrainState]:
+    """Returns a run's policy as it acts in an experiment, with the `lesion` of a command's options.
+
+    Arguments and errors as `setup_of` and `lesions.lesioned` have them.
+    """
+    setup = setup_of(experiment, run)
+    return lesions.lesioned(setup, run.state, options.lesion, options.seed)[:2]
+
+
+def changes(before: Experiment, now: Experiment, lesion: Lesion) -> list[str]:
+    """Returns what of an environment, and of a network's units, is changed: `a: before -> now`."""
+    pairs = {"env": before.env, "lesion": Lesion()}, {"env": now.env, "lesion": lesion}
+    return differences(*map(to_json, pairs))
 
 
 def program(setup: Setup, state: TrainState, options: Any) -> Callable[..., Any]:

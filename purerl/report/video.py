@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -13,7 +14,9 @@ from PIL import Image
 
 from purerl.core.errors import RunError, UserError, one_line
 from purerl.core.keys import Purpose, derive
+from purerl.core.records import TrainState
 from purerl.experiment import loading
+from purerl.experiment.objects import Setup
 from purerl.experiment.options import check_seed
 from purerl.machine.files import check_inside
 from purerl.report import run_reader
@@ -23,46 +26,49 @@ from purerl.report.renderer import Renderer, model_of
 from purerl.runs.loaded_run import Run
 
 Size = tuple[int, int]  # width and height [pixels]
+Acting = tuple[Setup, TrainState]  # a policy with its state, and its environment
 SHEET = 4  # rows and columns of the contact sheet
 SHEET_WIDTH = 320  # of each of its images [pixels]
 
 
 def make_video(
-    run: Run, camera: str, episodes: int, seconds: float, size: Size, seed: int
+    run: Run, acting: Acting, size: Size, options: Any, changes: Sequence[str] = ()
 ) -> tuple[Path, list[str]]:
     """Plays episodes by the deterministic policy, and writes a video and a contact sheet of them.
 
     Args:
       run: the run; the files go to `videos_of` its folder.
-      camera: a camera's name or number in the model; "": one that follows the body.
-      episodes: how many, one after the other.
-      seconds: at most so much of each [s].
+      acting: who acts and where, the run's own or with `changes`.
       size: width and height of a frame [pixels].
-      seed: of the episodes.
+      options: of `render`: a camera, episodes, seconds of each, and their seed.
+      changes: what is not the run's own, as `a: before -> now`; the files are named after it.
 
     Returns:
-      The video's path, and a line about each episode and one about the last evaluation.
+      The video's path, and a line about each episode and, without `changes`, one about the last
+      evaluation.
 
     Raises:
       UserError: the run, the checkpoint or the camera is not one.
       RunError: there is no OpenGL, or the files cannot be written.
     """
-    timestep = run.env.control_timestep
+    env, seed = acting[0].env, options.seed
     # The files are named after the update, and after what is not the default.
-    words = [f"{run.update:012d}", camera.replace("/", "-"), f"seed{seed}" if seed else ""]
-    path = videos_of(run.folder) / f"{'_'.join(filter(None, words))}.mp4"
-    with renderer_of(run.env, size, camera) as renderer:
-        recording = _play(run, episodes, seconds, seed)
-        draw(path, renderer, recording, timestep)
+    words = [f"{run.update:012d}", options.camera, f"seed{seed}" if seed else "", *changes]
+    name = "_".join(re.sub(r"(: .* -> |[^\w.-])+", "-", word).strip("-") for word in words if word)
+    path = videos_of(run.folder) / f"{name}.mp4"
+    with renderer_of(env, size, options.camera) as renderer:
+        recording = _play(acting, options.episodes, options.seconds, seed)
+        draw(path, renderer, recording, env.control_timestep)
     told = zip(recording.length, recording.over, recording.episode_return, strict=True)
     lines = [
-        f"update {run.update:,}, episode {i + 1}: {length * timestep:.1f} s "
+        f"update {run.update:,}, episode {i + 1}: {length * env.control_timestep:.1f} s "
         f"({'to its end' if over else 'cut there'}), return {episode_return:.2f}"
         for i, (length, over, episode_return) in enumerate(told)
     ]
     whole = [float(value) for value in recording.episode_return[recording.over]]
     with contextlib.suppress(UserError):  # metrics that cannot be read spoil no video
-        lines += beside_evaluation(run_reader.read(run.folder).lines, run.update, whole)
+        if not changes:
+            lines += beside_evaluation(run_reader.read(run.folder).lines, run.update, whole)
     return path, lines
 
 
@@ -91,7 +97,8 @@ def frames(
     timestep = run.env.control_timestep
     stride = frame_stride(timestep)
     with renderer_of(run.env, size, str(camera)) as renderer:
-        pictures = episode_pictures(_play(run, 1, seconds, seed), 0, stride)
+        acting = run.restored.setup, run.state
+        pictures = episode_pictures(_play(acting, 1, seconds, seed), 0, stride)
         return np.stack(list(renderer.draw_episode(pictures))), 1.0 / (stride * timestep)
 
 
@@ -148,13 +155,13 @@ def beside_evaluation(
     return [said + f"whole episodes above in that range: {among} of {len(whole)}"]
 
 
-def _play(run: Run, episodes: int, seconds: float, seed: int) -> Recording:
+def _play(acting: Acting, episodes: int, seconds: float, seed: int) -> Recording:
     """Plays episodes of at most `seconds` [s]; returns their pictures as numpy arrays."""
-    setup = run.restored.setup
-    steps = max(1, round(min(seconds / run.env.control_timestep, setup.config.episode_length)))
+    setup, state = acting
+    steps = max(1, round(min(seconds / setup.env.control_timestep, setup.config.episode_length)))
     key = derive(jax.random.key(seed), Purpose.VIDEO)
     played = jax.jit(lambda state, key: record(setup, state, key, episodes, steps))
-    return jax.device_get(played(run.state, key))
+    return jax.device_get(played(state, key))
 
 
 def _write_files(

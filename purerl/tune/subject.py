@@ -111,3 +111,15 @@ def chosen(
     if subject.run is None and getattr(options, "checkpoint", "latest") != "latest":
         raise UserError(f"{subject.name} is an experiment: --checkpoint is for a run's folder.")
     return experiment, options
+
+
+def one_run(words: Sequence[str], prog: str, base: Any) -> tuple[str, Any, Any, Any]:
+    """Returns the name of the one run that a command line means, and what `load` returned of it.
+
+    Behind them the experiment and the options, as `chosen`.
+    """
+    found, runs, words = find_runs(words, prog)
+    if len(runs) > 1:
+        raise UserError(f"{len(runs)} runs are given; {prog.split('.')[-1]} one at a time.")
+    ((name, run),) = runs.items()
+    return name, run, *chosen(found, words, prog, base)

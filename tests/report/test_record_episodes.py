@@ -1,6 +1,7 @@
 """`python -m purerl.record RUN`: its arrays are the run's policy, step by step."""
 
 import json
+import types
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -115,15 +116,31 @@ def test_a_memory_is_what_the_step_before_left(lstm):
         np.testing.assert_allclose(memory[:, 1:], left, rtol=1e-6, atol=1e-7)
 
 
+def test_one_run_is_recorded_at_a_time(monkeypatch, capsys):
+    found = None, {"a": None, "b": None}, []
+    monkeypatch.setattr(record.subject, "find_runs", lambda words, prog: found)
+    assert record.main(["a", "b"]) == USAGE
+    assert "2 runs are given; record one at a time." in capsys.readouterr().err
+
+
 def test_hdf5_has_each_array_where_it_is_looked_for_and_names_its_axes(mlp, tmp_path):
     h5py = pytest.importorskip("h5py", reason="pip install -e '.[clips]'")
     file, arrays = tmp_path / "out.h5", mlp.arrays | {"length": np.array([30, 7, 0])}
+    arrays["task/clip"] = np.array([[1], [0], [1]]).repeat(30, axis=1)  # as in imitation
     env = load(mlp.folder).env
-    record.write(record.RecordOptions(out=file), arrays, env, {"run": "mine"})
+    named = types.SimpleNamespace(
+        physics=env.physics, control_timestep=env.control_timestep, names=("Rear_1", "Run_2")
+    )
+    record.write(record.RecordOptions(out=file), arrays, named, {"run": "mine"})
     with h5py.File(file) as found:
         assert found["metadata"].attrs["run"] == "mine"
         steps = found["episodes/1/timesteps"]
         assert dict(steps.parent.attrs)["n_steps"] == 7
+        assert [found[f"episodes/{i}"].attrs["clip"] for i in range(3)] == [
+            "Run_2",
+            "Rear_1",
+            "Run_2",
+        ]
         places = {"physics/qpos": "qpos", "action": "action", "metrics/upright": "metrics/upright"}
         places |= {"observation": "observations/policy", "physics/time": "time"}
         places |= {f"network/policy{x}": f"activations/policy{x or '/__call__'}"

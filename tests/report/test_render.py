@@ -99,6 +99,27 @@ def test_what_is_not_the_default_stands_in_the_name(trained, capsys):
     assert re.search(r"evaluation after update 3: return .* in that range: [01] of 1", said)
 
 
+@pytest.mark.usefixtures("opengl")
+def test_another_environment_and_a_lesion_are_shown_and_named(trained, capsys):
+    """6 s."""
+    said = []
+    lesion = ["--lesion.layer", "policy/Dense_0", "--lesion.kind", "clamp", "--lesion.strength=9"]
+    for words in ([], ["--env.reset-noise", "1.5"], ["--env.reset-noise", "1.5", *lesion]):
+        assert render.main([str(trained), "--size", "32x32", *words]) == 0
+        said.append(capsys.readouterr().out)
+    returns = [re.search(r"return (\S+)", text)[1] for text in said]
+    assert len(set(returns)) == 3
+    assert ["evaluation after" in text for text in said] == [True, False, False]
+    videos = trained / "videos"
+    start, acting = (
+        "000000000003_env.reset_noise-1.5",
+        "lesion.kind-clamp_lesion.layer-policy-Dense_0",
+    )
+    one = read_video(videos / f"{start}.mp4")[1]
+    two = read_video(videos / f"{start}_{acting}_lesion.strength-9.0.mp4")[1]
+    assert (one[0] == two[0]).all() and (one[-1] != two[-1]).any()  # from the same start
+
+
 @pytest.mark.parametrize("name", ["a:b%03d.mp4", "http:x.mp4", "-y.mp4", "a[1].mp4"])
 def test_a_video_is_written_whatever_its_name(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
