@@ -51,9 +51,9 @@ def command(words: Sequence[str]) -> None:
     first, runs, words = subject.find_runs(words, PROG)
     experiment, options = subject.chosen(first, words, PROG, AskOptions)
     check_least(options, UserError, episodes=1)
+    asked = asking.cases(first.source, experiment, options, f"{PROG} {first.name}")
     for path in (options.out, options.out.with_suffix(".png")):
         files.check_new(path)
-    asked = asking.cases(first.source, experiment, options, PROG)
     answers = list(asking.ask(runs, asked, options))
     rows = asking.summarize(answers, options.outcome)
     table = comparison.table([(name, name) for name in asking.COLUMNS], rows)

@@ -36,6 +36,7 @@ from purerl.machine.output import show
 from purerl.tune import subject
 
 PROG = "python -m purerl.record"
+HDF5 = (".h5", ".hdf5")
 
 
 @dataclass(frozen=True)
@@ -55,18 +56,22 @@ def command(words: Sequence[str]) -> None:
     """Writes the file and tells what is in it."""
     from purerl.report import asking, episode_arrays
 
-    name, run, experiment, options = subject.one_run(words, PROG, RecordOptions)
+    found, experiment, options = subject.one_run(words, PROG, RecordOptions)
     check_least(options, UserError, episodes=1)
+    if options.clips and options.out.suffix not in HDF5:
+        raise UserError(f"out is {options.out}; a file of clips ends in {' or '.join(HDF5)}.")
     files.check_new(options.out)
-    if options.clips or options.out.suffix in (".h5", ".hdf5"):
+    if options.out.suffix in HDF5:
         command_errors.check_installed("h5py", "clips")
-    setup, state = asking.acting(run, experiment, options)
+    setup, state = asking.acting(found.run, experiment, options)
     arrays = episode_arrays.record(setup, state, options.seed, options.episodes)
-    write(options, arrays, setup.env, {"run": name, "digest": run.digest})
+    about = {"run": found.name, "update": found.run.update, "digest": found.run.digest}
+    about["changes"] = asking.changes(found.run.experiment, experiment, options)
+    write(options, arrays, setup.env, about)
     show(*(f"{name:32} {x.dtype} {list(x.shape)}" for name, x in arrays.items()), str(options.out))
 
 
-def write(options: RecordOptions, arrays: dict[str, Any], env: Any, about: dict[str, str]) -> None:
+def write(options: RecordOptions, arrays: dict[str, Any], env: Any, about: dict[str, Any]) -> None:
     """Writes what was recorded, in the layout that was asked for."""
     if options.clips:
         from purerl.clips import body, files as clip_files
@@ -77,7 +82,7 @@ def write(options: RecordOptions, arrays: dict[str, Any], env: Any, about: dict[
         tracks = {f"Episode_{i}": x[:length] for i, (x, length) in enumerate(both) if length}
         packed = body.pack(model, [*tracks.values()], [*tracks], 1.0 / env.control_timestep)
         clip_files.write(options.out, packed, model)
-    elif options.out.suffix in (".h5", ".hdf5"):
+    elif options.out.suffix in HDF5:
         from purerl.clips import episodes
 
         episodes.write(options.out, arrays, env, **about)

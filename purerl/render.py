@@ -44,7 +44,8 @@ def command(words: list[str]) -> None:
     """Makes the video, and prints which files it made."""
     # First of all: what follows imports mujoco, which looks for OpenGL itself.
     open_gl(16, 16).free()
-    output.show(*make(*subject.one_run(words, PROG, RenderOptions)[1:]))
+    found, experiment, options = subject.one_run(words, PROG, RenderOptions)
+    output.show(*make(found.run, experiment, options))
 
 
 def make(run: Any, experiment: Any, options: RenderOptions) -> list[str]:
@@ -60,7 +61,7 @@ def make(run: Any, experiment: Any, options: RenderOptions) -> list[str]:
 
     check_least(options, UserError, episodes=1, seconds=0.1)
     size, acting = _parse_size(options.size), asking.acting(run, experiment, options)
-    changes = asking.changes(run.experiment, experiment, options.lesion)
+    changes = asking.changes(run.experiment, experiment, options)
     output.say("Compiling and playing: for a large body that may take two minutes.")
     path, lines = make_video(run, acting, size, options, changes)
     return [*lines, str(path.with_suffix(".png")), str(path)]

@@ -51,7 +51,8 @@ def read(path: Path | str, rate: float = 0.0, frames: int = 0) -> Motion:
                 motion = _read_named(path, file) if named else _read_flat(path, file, frames)
     except (OSError, RuntimeError) as error:
         broken = "cannot be read" if getattr(error, "errno", None) else "is cut short or broken"
-        raise UserError(f"{path} {broken}: {reason(error)}.") from error
+        here = "" if path.is_absolute() else f" (in {Path.cwd()})"
+        raise UserError(f"{path} {broken}: {reason(error)}{here}.") from error
     _check_values(path, motion)
     if not (motion.rate or rate) > 0.0:
         raise UserError(f"{path} does not say its rate: give it, as rate=50 or --rate 50 [Hz].")
@@ -72,6 +73,8 @@ def _array(
         return other
     if name not in file:
         there: list[str] = []
+        if "episodes" in file:
+            raise UserError(f"{path} has episodes of `record`, no clips: record with --clips.")
         file.visit(there.append)
         raise UserError(f"{path} lacks {name}; there are: {some(there, 30) or 'none'}.")
     found = np.asarray(file[name])

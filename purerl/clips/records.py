@@ -88,7 +88,7 @@ def split(clips: Clips, held_out: float = 0.2, seed: int = 0) -> tuple[Clips, Cl
     if out.all() or not out.any():
         raise UserError(
             f"held_out is {held_out}, seed {seed}: {out.sum()} of {len(out)} clips are held out, "
-            "and neither side may be empty; give another share or seed."
+            "and neither side may be empty; give another share or seed, or take all of them."
         )
     return _take(clips, ~out), _take(clips, out)
 

@@ -6,19 +6,11 @@ the other for ever (docs/explanation/engines.md). One thread waits for nobody.
 """
 
 import os
-import sys
 from pathlib import Path
 
+from purerl.exact.xla_flags import jax_has_begun
+
 STALLING = 2
-
-
-def jax_has_begun() -> bool:
-    """Tells whether JAX has made its devices, after which it reads no environment."""
-    if "jax" not in sys.modules:
-        return False
-    from jax._src import xla_bridge  # JAX has no public way to ask without starting it
-
-    return xla_bridge.backends_are_initialized()
 
 
 def cpu_threads() -> int:

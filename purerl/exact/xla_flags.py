@@ -13,6 +13,7 @@ other. That changes no bit (`lab/2026-11-22-kernels.md`).
 """
 
 import os
+import sys
 
 # What XLA does instead of timing.
 RULES = {
@@ -49,11 +50,28 @@ PORTABLE = {
 KEPT_TIMINGS = "JAX_PERSISTENT_CACHE_ENABLE_XLA_CACHES"
 
 
+def jax_has_begun() -> bool:
+    """Tells whether JAX has made its devices, after which it reads no environment."""
+    if "jax" not in sys.modules:
+        return False
+    from jax._src import xla_bridge  # JAX has no public way to ask without starting it
+
+    return xla_bridge.backends_are_initialized()
+
+
 def set_xla_flags() -> None:
     """Adds to XLA_FLAGS what the user has not set there; to be called before JAX starts.
 
     If the user has set anything about timing, none of the `RULES` is added.
+
+    Raises:
+      RuntimeError: JAX has begun on a GPU, with kernels chosen by timing.
     """
+    if jax_has_begun() and how_chosen(sys.modules["jax"].default_backend()) == "by timing":
+        raise RuntimeError(
+            "JAX has begun on the GPU with kernels chosen by timing: call "
+            "purerl.exact.set_xla_flags() before JAX's first computation."
+        )
     flags, wanted = os.environ.get("XLA_FLAGS", ""), dict(GRAPHS)
     if not any(name.partition("=")[0] in flags for name in FIXING_FLAGS):
         wanted |= RULES
@@ -69,7 +87,13 @@ def set_portable_flags() -> None:
 
     Raises:
       ValueError: XLA_FLAGS says otherwise.
+      RuntimeError: JAX has begun with other flags.
     """
+    if jax_has_begun() and not is_portable():
+        raise RuntimeError(
+            "JAX has begun with other flags than portable bits need: begin a new process, or call "
+            "purerl.exact.set_portable_flags() before JAX's first computation."
+        )
     flags = os.environ.get("XLA_FLAGS", "").split()
     for name, value in PORTABLE.items():
         wanted = f"--{name}={value}"

@@ -121,10 +121,11 @@ def acting(run: Any, experiment: Experiment, options: Any) -> tuple[Setup, Train
     return lesions.lesioned(setup, run.state, options.lesion, options.seed)[:2]
 
 
-def changes(before: Experiment, now: Experiment, lesion: Lesion) -> list[str]:
-    """Returns what of an environment, and of a network's units, is changed: `a: before -> now`."""
-    pairs = {"env": before.env, "lesion": Lesion()}, {"env": now.env, "lesion": lesion}
-    return differences(*map(to_json, pairs))
+def changes(before: Experiment, now: Experiment, options: Any) -> list[str]:
+    """Returns what of an environment and a command's options is not as usual: `a: old -> new`."""
+    usual = {"env": before.env, **vars(type(options)())}
+    found = differences(to_json(usual), to_json({"env": now.env, **vars(options)}))
+    return [line for line in found if line.partition(":")[0] not in ("checkpoint", "trust", "out")]
 
 
 def program(setup: Setup, state: TrainState, options: Any) -> Callable[..., Any]:

@@ -38,26 +38,26 @@ def make_video(
 
     Args:
       run: the run; the files go to `videos_of` its folder.
-      acting: who acts and where, the run's own or with `changes`.
+      acting: who acts and where.
       size: width and height of a frame [pixels].
       options: of `render`: a camera, episodes, seconds of each, and their seed.
-      changes: what is not the run's own, as `a: before -> now`; the files are named after it.
+      changes: what is not as usual, as `a: old -> new`; the files are named after it.
 
     Returns:
-      The video's path, and a line about each episode and, without `changes`, one about the last
-      evaluation.
+      The video's path, and a line about each episode and, in the run's own environment, one about
+      the last evaluation.
 
     Raises:
       UserError: the run, the checkpoint or the camera is not one.
       RunError: there is no OpenGL, or the files cannot be written.
     """
-    env, seed = acting[0].env, options.seed
+    env = acting[0].env
     # The files are named after the update, and after what is not the default.
-    words = [f"{run.update:012d}", options.camera, f"seed{seed}" if seed else "", *changes]
-    name = "_".join(re.sub(r"(: .* -> |[^\w.-])+", "-", word).strip("-") for word in words if word)
+    words = [f"{run.update:012d}", *changes]
+    name = "_".join(re.sub(r"(: .* -> |[^\w.-])+", "-", word).strip("-") for word in words)
     path = videos_of(run.folder) / f"{name}.mp4"
     with renderer_of(env, size, options.camera) as renderer:
-        recording = _play(acting, options.episodes, options.seconds, seed)
+        recording = _play(acting, options.episodes, options.seconds, options.seed)
         draw(path, renderer, recording, env.control_timestep)
     told = zip(recording.length, recording.over, recording.episode_return, strict=True)
     lines = [
@@ -67,7 +67,7 @@ def make_video(
     ]
     whole = [float(value) for value in recording.episode_return[recording.over]]
     with contextlib.suppress(UserError):  # metrics that cannot be read spoil no video
-        if not changes:
+        if not any(line.startswith(("env.", "lesion.")) for line in changes):
             lines += beside_evaluation(run_reader.read(run.folder).lines, run.update, whole)
     return path, lines
 

@@ -174,13 +174,11 @@ def set_xla_flags_in_time() -> None:
 
     Then the manifest says that the run is not bit-exact. On a CPU they change nothing.
     """
-    if _runs_on_gpu() and xla_flags.how_chosen("gpu") == "by timing":
-        output.say(
-            "JAX has begun on the GPU with kernels chosen by timing, so this run is not bit-exact: "
-            "call purerl.exact.set_xla_flags() before JAX's first computation."
-        )
+    try:
+        xla_flags.set_xla_flags()
+    except RuntimeError as error:
+        output.say(f"This run is not bit-exact: {error}")
         return
-    xla_flags.set_xla_flags()
     kept = os.environ.get(xla_flags.KEPT_TIMINGS)
     if "jax" in sys.modules and kept is not None:  # it read the environment when it was imported
         sys.modules["jax"].config.update(xla_flags.KEPT_TIMINGS.lower(), kept)
@@ -194,19 +192,10 @@ def set_portable_flags_in_time() -> None:
             f"({manifest.processor('model name') or platform.machine()}) has not both; leave out "
             "--portable."
         )
-    if threads.jax_has_begun() and not xla_flags.is_portable():
-        raise UserError(
-            "JAX has begun with other flags than portable bits need: begin a new process, or call "
-            "purerl.exact.set_portable_flags() before JAX's first computation."
-        )
     try:
         xla_flags.set_portable_flags()
-    except ValueError as error:
+    except (RuntimeError, ValueError) as error:
         raise UserError(str(error)) from error
-
-
-def _runs_on_gpu() -> bool:
-    return threads.jax_has_begun() and sys.modules["jax"].default_backend() == "gpu"
 
 
 def _raise(code: int) -> None:

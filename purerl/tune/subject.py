@@ -1,5 +1,6 @@
 """What is planned for or looked at: an experiment, or a run with what it has learned."""
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,9 +88,9 @@ def find_runs(words: Sequence[str], prog: str) -> tuple[Subject, dict[str, Any],
     if names := some(seed_statistics.differing(records), 3):
         raise UserError(f"The runs differ in {names}; give runs that differ in their seed alone.")
     found = [find([str(x.path), *words[number:]], prog) for x in records]
-    paths = [(Path(x.name), x.run) for x in found]
-    runs = {path.name if loading.is_shipped(path) else str(path): run for path, run in paths}
-    return found[0], runs, list(words[number:])
+    shipped = [loading.is_shipped(path := Path(x.name)) and path.name for x in found]
+    found = [x._replace(name=name or x.name) for x, name in zip(found, shipped, strict=True)]
+    return found[0], {x.name: x.run for x in found}, list(words[number:])
 
 
 def chosen(
@@ -107,19 +108,16 @@ def chosen(
     Raises:
       UserError: there is no such option, or a value is wrong.
     """
+    prog = f"{prog} {shlex.quote(subject.name)}"
     experiment, options = from_command_line(subject.source, words, prog, base=base, names=names)
     if subject.run is None and getattr(options, "checkpoint", "latest") != "latest":
         raise UserError(f"{subject.name} is an experiment: --checkpoint is for a run's folder.")
     return experiment, options
 
 
-def one_run(words: Sequence[str], prog: str, base: Any) -> tuple[str, Any, Any, Any]:
-    """Returns the name of the one run that a command line means, and what `load` returned of it.
-
-    Behind them the experiment and the options, as `chosen`.
-    """
+def one_run(words: Sequence[str], prog: str, base: Any) -> tuple[Any, Any, Any]:
+    """Returns the one run that a command line means, and experiment and options as `chosen`."""
     found, runs, words = find_runs(words, prog)
     if len(runs) > 1:
         raise UserError(f"{len(runs)} runs are given; {prog.split('.')[-1]} one at a time.")
-    ((name, run),) = runs.items()
-    return name, run, *chosen(found, words, prog, base)
+    return found, *chosen(found, words, prog, base)

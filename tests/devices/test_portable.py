@@ -12,7 +12,7 @@ import pytest
 
 import purerl
 from purerl.core.errors import USAGE
-from purerl.devices import compilation, threads
+from purerl.devices import compilation
 from purerl.exact import xla_flags
 from purerl.runs import manifest
 
@@ -52,6 +52,7 @@ def portable(monkeypatch):
     """An environment as `--portable` sets it; the one of before comes back."""
     for name in ("XLA_FLAGS", "NPROC"):
         monkeypatch.setenv(name, "")
+    monkeypatch.setattr(xla_flags, "jax_has_begun", lambda: False)
     xla_flags.set_portable_flags()
 
 
@@ -85,7 +86,7 @@ def test_where_portable_bits_cannot_be_had_is_one_line(tmp_path, monkeypatch):
 
     jax.devices()
     refused("JAX has begun with other flags")
-    monkeypatch.setattr(threads, "jax_has_begun", lambda: False)
+    monkeypatch.setattr(xla_flags, "jax_has_begun", lambda: False)
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_max_isa=SSE4_2")
     refused("XLA_FLAGS has --xla_cpu_max_isa=SSE4_2; portable bits need --xla_cpu_max_isa=AVX2")
     old = {"flags": "fpu avx fma", "model name": "An old one"}

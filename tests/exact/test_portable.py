@@ -13,6 +13,7 @@ from hypothesis import given, settings, strategies as st
 from jax import lax
 
 from purerl import exact
+from purerl.exact import xla_flags
 from purerl.exact.portable import LibraryError
 from tests.exact import named
 
@@ -167,6 +168,10 @@ def test_the_other_flags_stay_and_a_contrary_one_is_named(monkeypatch):
     monkeypatch.setenv("NPROC", "9")
     monkeypatch.setenv("XLA_FLAGS", "--xla_a=b --xla_cpu_multi_thread_eigen=false")
     assert not exact.is_portable()
+    jax.devices()
+    with pytest.raises(RuntimeError, match="JAX has begun with other flags"):
+        exact.set_portable_flags()
+    monkeypatch.setattr(xla_flags, "jax_has_begun", lambda: False)
     exact.set_portable_flags()
     assert exact.is_portable() and os.environ["XLA_FLAGS"].startswith("--xla_a=b --xla_cpu_multi")
     once = os.environ["XLA_FLAGS"]

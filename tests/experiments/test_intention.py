@@ -9,12 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from purerl import Network, Normal, PolicyOutput, clips, eyes, networks, run
+from purerl import Network, Normal, PolicyOutput, eyes, networks, run
 from purerl.core.errors import INTERRUPTED, SUCCESS
 from purerl.devices.programs import abstract_state
-from purerl.envs import body_parts
 from purerl.experiment import objects
-from purerl.experiments import intention, rodent_gaps_reuse, rodent_intention
+from purerl.experiments import (
+    ant_gaps_reuse,
+    ant_intention,
+    intention,
+    rodent_gaps_reuse,
+    rodent_intention,
+)
 from purerl.experiments.intention import Coder, Decoder, divergence, in_ball
 from purerl.machine.state_arrays import leaf_paths
 from tests import quick
@@ -337,20 +342,20 @@ def test_a_killed_run_goes_on_without_the_run_it_was_taken_from(old, reused, tmp
 
 
 @pytest.mark.slow
-def test_the_rodents_parts_fit_the_gaps(tmp_path):
-    """What is taken over has in both experiments the same shapes, and acts at the same rate."""
+@pytest.mark.parametrize(
+    ("imitates", "reuses", "first_layer"),
+    [(ant_intention, ant_gaps_reuse, (63 + 8, 128)),
+     (rodent_intention, rodent_gaps_reuse, (277 + 16, 512))],
+)  # fmt: skip
+def test_what_is_taken_over_fits_the_gaps(imitates, reuses, first_layer):
+    """It has in both experiments the same shapes, and acts at the same rate."""
     pytest.importorskip("h5py", reason="pip install -e '.[clips]'")
-    model = body_parts.find("rodent", (), "c", 0.004).model
-    file = tmp_path / "motion.h5"
-    still = np.tile(model.qpos0, (20, 1))
-    clips.write(file, clips.pack(model, [still], ["Stand_1"], 50.0), model)
-    imitates, reuses = rodent_intention.experiment, rodent_gaps_reuse.experiment
-    imitates = dataclasses.replace(imitates, env=dataclasses.replace(imitates.env, clips=str(file)))
+    imitates, reuses = imitates.experiment, reuses.experiment
     built = [objects.build(dataclasses.replace(x, parts={})) for x in (imitates, reuses)]
     assert built[0].env.control_timestep == pytest.approx(built[1].env.control_timestep)
     states = [abstract_state(*x[:3]) for x in built]
     before, after = (dict(zip(leaf_paths(x), jax.tree.leaves(x), strict=True)) for x in states)
-    assert after["params/params/decoder/Tower_0/Dense_0/kernel"].shape == (277 + 16, 512)
+    assert after["params/params/decoder/Tower_0/Dense_0/kernel"].shape == first_layer
     taken = ("params/params/decoder/", "params/params/prior/", "normalizer/mean/proprioception/")
     for name, x in after.items():
         if name.startswith(taken):

@@ -226,6 +226,8 @@ def test_a_module_that_is_applied_twice_is_noted_twice():
         (["--out", "/tmp"], "/tmp cannot be written"),
         (["--out", __file__], "is there: name another file, or take that one away"),
         (["--out", "/dev/full", "--episodes", "1"], "/dev/full cannot be written: No space left"),
+        (["--clips"], "out is episodes.npz; a file of clips ends in .h5 or .hdf5."),
+        (["--env.reset-nois", "1"], "All options: python -m purerl.record /"),
         (["--lesion.kind", "noise"], "The lesion has no layer: add --lesion.layer"),
         (["--checkpoint", "77"], "There is no checkpoint '77'"),
     ],

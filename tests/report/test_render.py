@@ -68,12 +68,13 @@ def only_line(capsys) -> str:
 def test_video_and_sheet_show_the_episode_in_real_time(trained, capsys):
     words = ["--size", "160x120", "--seconds", "0.8", "--episodes", "2"]
     assert render.main([str(trained), *words]) == 0
-    about, frames = read_video(trained / "videos" / "000000000003.mp4")
+    name = "000000000003_episodes-2_seconds-0.8_size-160x120"
+    about, frames = read_video(trained / "videos" / f"{name}.mp4")
     assert about["size"] == (160, 120) and about["fps"] == 50.0
     assert len(frames) == 2 * (1 + 40)  # 0.8 s of 20 ms, and the start, twice
     assert np.abs(frames[0].astype(int) - frames[40]).max() > 60  # the pole has moved
     assert np.abs(frames[0].astype(int) - frames[41]).mean() < 3  # and hangs again
-    with Image.open(trained / "videos" / "000000000003.png") as sheet:
+    with Image.open(trained / "videos" / f"{name}.png") as sheet:
         assert sheet.size == (4 * 320, 4 * 240)
         cells = np.asarray(sheet, int)
     for cell, moment in ((0, 0), (7, 38), (15, 81)):  # evenly spaced over 82 frames
@@ -84,7 +85,7 @@ def test_video_and_sheet_show_the_episode_in_real_time(trained, capsys):
     assert said.startswith("Compiling and playing: ")
     assert "update 3, episode 2: 0.8 s (cut there)" in said
     files = [line.rpartition("/")[2] for line in said.splitlines()[-2:]]
-    assert files == ["000000000003.png", "000000000003.mp4"]
+    assert files == [f"{name}.png", f"{name}.mp4"]
     assert "no episode above came to its end" in said
 
 
@@ -92,7 +93,7 @@ def test_video_and_sheet_show_the_episode_in_real_time(trained, capsys):
 def test_what_is_not_the_default_stands_in_the_name(trained, capsys):
     words = ["--size", "64x48", "--seed", "3", "--camera", "front"]
     assert render.main([str(trained), *words]) == 0
-    _, frames = read_video(trained / "videos" / "000000000003_front_seed3.mp4")
+    _, frames = read_video(trained / "videos" / "000000000003_camera-front_seed-3_size-64x48.mp4")
     assert len(frames) == 61  # the whole episode
     said = capsys.readouterr().out
     assert "1.2 s (to its end)" in said
@@ -115,8 +116,8 @@ def test_another_environment_and_a_lesion_are_shown_and_named(trained, capsys):
         "000000000003_env.reset_noise-1.5",
         "lesion.kind-clamp_lesion.layer-policy-Dense_0",
     )
-    one = read_video(videos / f"{start}.mp4")[1]
-    two = read_video(videos / f"{start}_{acting}_lesion.strength-9.0.mp4")[1]
+    one = read_video(videos / f"{start}_size-32x32.mp4")[1]
+    two = read_video(videos / f"{start}_{acting}_lesion.strength-9.0_size-32x32.mp4")[1]
     assert (one[0] == two[0]).all() and (one[-1] != two[-1]).any()  # from the same start
 
 

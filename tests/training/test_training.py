@@ -12,6 +12,7 @@ import threading
 from pathlib import Path
 from typing import Literal
 
+import jax
 import pytest
 from hypothesis import given, settings, strategies as st
 
@@ -266,11 +267,13 @@ def test_a_video_is_the_commands(tmp_path):
 )
 def test_flags_that_come_too_late_for_a_gpu_are_not_claimed(monkeypatch, capsys, flags, said):
     monkeypatch.setenv("XLA_FLAGS", flags)
-    monkeypatch.setattr(train, "_runs_on_gpu", lambda: True)
+    jax.devices()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     train.set_xla_flags_in_time()
     assert ("not bit-exact" in capsys.readouterr().out) == said
     assert (xla_flags.how_chosen("gpu") == "by timing") == said
-    monkeypatch.setattr(train, "_runs_on_gpu", lambda: False)
+    monkeypatch.undo()
+    monkeypatch.setenv("XLA_FLAGS", "")
     train.set_xla_flags_in_time()
     assert xla_flags.how_chosen("gpu") == "fixed" and not capsys.readouterr().out
 
