@@ -17,7 +17,7 @@ from purerl.exact.kernel.values import DTYPES, Const, Held, Map, Value, View, ki
 
 SMALL = 256  # numbers: what is larger is not kept beyond its block to be computed once
 FEW_TERMS = 4  # a row of so few is written out, each term where it is needed
-MOST_WRITTEN_OUT = 8192
+MOST_WRITTEN_OUT = 1 << 17
 FEW = 4  # numbers: one of so few is chosen, one of more is read from memory
 # What a fold of nothing gives.
 NOTHING = {"add": 0, "mul": 1, "or": 0, "and": 1, "max": -np.inf, "min": np.inf}
