@@ -14,10 +14,14 @@ import numpy as np
 from purerl.exact.kernel import lanes, values
 from purerl.exact.kernel.operations import computed
 from purerl.exact.kernel.values import DTYPES, Const, Held, Map, Value, View, kind_of
+from purerl.exact.kernel.zeros import Zeros
 
 SMALL = 256  # numbers: what is larger is not kept beyond its block to be computed once
 FEW_TERMS = 4  # a row of so few is written out, each term where it is needed
 MOST_WRITTEN_OUT = 1 << 17
+# A sum of so many terms, in all rows, is made without those that are known to be 0, if only one in
+# so many is not. Rows that are made one fold have at least this share of the longest one's terms.
+MANY_TERMS, MANY_ZEROS, SHORTEST = 4096, 2, 0.6
 FEW = 4  # numbers: one of so few is chosen, one of more is read from memory
 # What a fold of nothing gives.
 NOTHING = {"add": 0, "mul": 1, "or": 0, "and": 1, "max": -np.inf, "min": np.inf}
@@ -30,6 +34,7 @@ class Builder:
         """Begins a kernel."""
         self.top = values.Block("top")
         self.blocks = [self.top]
+        self.zeros = Zeros()
         self._constants: dict[Any, Const] = {}
 
     @contextlib.contextmanager
@@ -130,7 +135,35 @@ class Builder:
         new = values.Fold(shape, arg.kind, self.top, op, arg, terms)
         new.width = lanes.width_of(new)
         new.shared = lanes.are_shared(new)
-        return self._once(("fold", op, id(arg), shape), new, [arg])
+        packed = None if new.width else self._packed(new)
+        return packed or self._once(("fold", op, id(arg), shape), new, [arg])
+
+    def _packed(self, fold: values.Fold) -> Value | None:
+        """Returns a fold without most of its terms that are known to be 0; None if they are few.
+
+        Rows of about as many other terms are made one fold. Of a symmetric square, which a Hessian
+        is, the upper half is the lower one.
+        """
+        if fold.op != "add" or fold.arg.size < MANY_TERMS:
+            return None
+        zero = self.zeros.of(fold.arg).reshape(fold.size, fold.terms)
+        counts = fold.terms - zero.sum(1)
+        if MANY_ZEROS * counts.sum() > fold.arg.size:
+            return None
+        order, terms = np.argsort(zero, 1, kind="stable"), fold.arg.places.reshape(zero.shape)
+        n = lanes.width_of(fold, fold.size)
+        rows = np.arange(fold.size)
+        mirrored = rows % n * n + rows // n if n else rows
+        rows, counts = np.maximum(rows, mirrored), np.where(rows < mirrored, 0, counts)
+        parts: list[Value] = [self.const(np.zeros(1, DTYPES[fold.kind]))]
+        which, index = np.zeros(fold.size, int), np.zeros(fold.size, int)
+        while (most := counts.max()) > 0:
+            (some,) = np.nonzero(counts > SHORTEST * most)
+            which[some], index[some] = len(parts), np.arange(len(some))
+            places = terms[some[:, None], order[some, :most]]
+            parts.append(self.fold("add", self.pick(fold.arg, places), (len(some),)))
+            counts[some] = 0
+        return self.view(parts, which[rows].reshape(fold.shape), index[rows].reshape(fold.shape))
 
     def take(self, value: Value, index: np.ndarray) -> Value:
         """Returns the numbers at places, in the shape of `index`."""

@@ -15,12 +15,14 @@ from purerl.exact.kernel import values
 from purerl.exact.kernel.lanes import LANES
 from purerl.exact.kernel.operations import OPERATIONS
 from purerl.exact.kernel.values import Block, Fold, Map, Step, Value, View
+from purerl.exact.kernel.zeros import Zeros
 
 MOST_REPEATED = 16  # additions that may be made again, in all, because numbers are read repeatedly
 # A value that is read a few times is computed anew if that costs about as much as reading it; a
 # large one, which would take much memory, if it costs several times as much.
 FEW_USES, CHEAP = 4, 1
 LARGE, CHEAP_OF_LARGE = 400, 8
+MUCH = 1024  # known zeros of a value: then they are left out, and where the others stand is a table
 
 
 def blocks_of(step: Step) -> list[Block]:
@@ -73,6 +75,7 @@ class Uses:
         self.sites: dict[Value, dict[Any, Site]] = collections.defaultdict(dict)
         self.read: dict[Value, np.ndarray] = {}  # whether anything reads each number, [size]
         self.as_they_stand: set[Value] = set()  # read by a step, or by a view of several values
+        self.whole: set[Value] = set()  # read as a row that has all numbers
         self.keep: set[Value] = set()
         self.costs: dict[Value, int] = {}  # of computing one number of a value that is not kept
 
@@ -112,15 +115,25 @@ class Uses:
         return max(int(np.bincount(x.places.reshape(-1)).max(initial=0)) for x in sites)
 
 
-def kept(top: Block, outputs: list[Value]) -> dict[Value, np.ndarray]:
-    """Returns the maps and folds that stand in memory, and the places that are read of each."""
+def kept(top: Block, outputs: list[Value], zeros: Zeros) -> dict[Value, np.ndarray]:
+    """Returns the maps and folds that stand in memory, and which of the numbers of each do.
+
+    The others are never read, or are known to be 0.
+    """
     items, repeated = list(in_order(top)), set[Value]()
     while True:
         uses = _uses(top, outputs, items, repeated)
         more = _not_repeated(uses, items)
         if not more:
-            return {value: np.flatnonzero(uses.read[value]) for value in uses.keep}
+            return {value: _places(value, uses, zeros) for value in uses.keep}
         repeated |= more
+
+
+def _places(value: Value, uses: Uses, zeros: Zeros) -> np.ndarray:
+    read = uses.read[value]
+    others = read & ~zeros.of(value)
+    much = value not in uses.whole and others.any() and read.sum() - others.sum() >= MUCH
+    return np.flatnonzero(others if much else read)
 
 
 def _uses(top: Block, outputs: list[Value], items: list[Any], repeated: set[Value]) -> Uses:
@@ -158,6 +171,7 @@ def _add_step(uses: Uses, step: Step) -> None:
     """Notes what a step reads: only a system's matrix, and results, have to stand in memory."""
     for value in step.reads:
         matrix = isinstance(step, values.Linear) and value is not step.reads[-1]
+        uses.whole |= {value} if matrix else set()
         uses.add(value, Site(value, step.block, value.places), stands=matrix)
     if isinstance(step, values.Loop) and step.test and step.going:
         uses.add(step.going, Site(step, step.test, step.going.places))
@@ -179,6 +193,7 @@ def _add_args(uses: Uses, item: Map | Fold) -> None:
             uses.add(arg, site)
     if isinstance(item, Map) and item.op == "lookup":
         table = item.param
+        uses.whole.add(table)
         uses.add(table, Site(item, item.block, table.places.reshape(-1)), stands=True)
 
 

@@ -19,7 +19,7 @@ class _Row(NamedTuple):
 
     home: Held
     places: np.ndarray
-    ranks: np.ndarray  # of each number of the value, its place in `home`
+    ranks: np.ndarray  # of each number of the value its place in `home`, or -1
 
 
 class Scheduler:
@@ -31,7 +31,7 @@ class Scheduler:
         self.slots: dict[int, int] = {}
         self.keep = {
             x: _Row(Held(places.shape, x.kind, x.block), places, _ranks(places, x.size))
-            for x, places in keeping.kept(program.block, program.outputs).items()
+            for x, places in keeping.kept(program.block, program.outputs, program.zeros).items()
         }
         self.outputs = [Held(x.shape, x.kind, program.block) for x in program.outputs]
         pairs = list(zip(program.outputs, self.outputs, strict=True))
@@ -131,15 +131,14 @@ class _Expression:
             first = int(which.flat[0])
             if (which == first).all():
                 return self.add(value.sources[first], index)
-            return self._mixed(value, which, index)
+            return self._standing(value.sources, which, index)
         key = id(value), places.tobytes()
         if key not in self.known:
             if isinstance(value, Const):
                 numbers = value.array.reshape(-1)[places]
                 self.known[key] = self._leaf(Leaf(value.kind, (), places, numbers))
             elif isinstance(value, Held) or value in self.scheduler.keep:
-                source, at = self._standing(value, places)
-                self.known[key] = self._leaf(Leaf(value.kind, (source,), np.zeros_like(at), at))
+                self.known[key] = self._standing([value], np.zeros_like(places), places)
             else:
                 assert isinstance(value, Map), "a fold is kept"
                 self.known[key] = self.compute(value, places)
@@ -155,22 +154,23 @@ class _Expression:
         self.into.lines.append(Line(value.op, value.kind, param, args))
         return len(self.into.lines) - 1
 
-    def _mixed(self, value: View, which: np.ndarray, index: np.ndarray) -> int:
-        """Returns the leaf for numbers of several values, all of which stand in memory."""
-        numbers, which = np.unique(which, return_inverse=True)
-        which, index, sources = which.reshape(index.shape), index.copy(), []
-        for number, source in enumerate(value.sources[i] for i in numbers):
-            here = which == number
-            stands, index[here] = self._standing(source, index[here])
-            sources.append(stands)
-        return self._leaf(Leaf(value.kind, tuple(sources), which, index))
-
-    def _standing(self, value: Value, places: np.ndarray) -> tuple[Value, np.ndarray]:
-        """Returns in which row numbers stand, and where in it."""
-        if isinstance(value, Const):
-            return SLOTS, self.scheduler.slots_of(value, places)
-        row = self.scheduler.keep.get(value)
-        return (row.home, row.ranks[places]) if row else (home(value), places)
+    def _standing(self, sources: Sequence[Value], which: np.ndarray, index: np.ndarray) -> int:
+        """Returns the leaf for numbers of values that stand in memory (see `View`)."""
+        homes: list[Value] = [SLOTS]
+        group, at = np.zeros_like(index), np.empty_like(index)
+        for number in np.unique(which):
+            here, source = which == number, sources[number]
+            if isinstance(source, Const):
+                at[here] = self.scheduler.slots_of(source, index[here])
+                continue
+            row = self.scheduler.keep.get(source)
+            at[here] = row.ranks[index[here]] if row else index[here]
+            group[here] = len(homes)
+            homes.append(self.scheduler.home(source))
+        if (at < 0).any():  # known to be 0
+            group[at < 0] = 0
+            at[at < 0] = self.scheduler.slots.setdefault(0, len(self.scheduler.slots))
+        return self._leaf(Leaf(sources[0].kind, tuple(homes), group, at))
 
     def _leaf(self, leaf: Leaf) -> int:
         self.into.leaves.append(leaf)
