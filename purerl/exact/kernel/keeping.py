@@ -132,7 +132,7 @@ def kept(top: Block, outputs: list[Value], zeros: Zeros) -> dict[Value, np.ndarr
 def _places(value: Value, uses: Uses, zeros: Zeros) -> np.ndarray:
     read = uses.read[value]
     others = read & ~zeros.of(value)
-    much = value not in uses.whole and others.any() and read.sum() - others.sum() >= MUCH
+    much = value not in uses.whole and others.any() and value.size - others.sum() >= MUCH
     return np.flatnonzero(others if much else read)
 
 

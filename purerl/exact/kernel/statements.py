@@ -89,7 +89,11 @@ class StepStatement:
     plans: list["Plan"]
     which: Code | None = None  # of a choice: the number of the branch
     matrices: Sequence[Value] = ()  # of a solve: where its matrix stands
-    waits = False  # what it computes is needed by most of what follows
+
+    @property
+    def waits(self) -> bool:
+        """Tells whether it may run late: most of what follows needs what loops compute."""
+        return isinstance(self.step, values.Linear)
 
     @property
     def writes(self) -> list[Value]:
