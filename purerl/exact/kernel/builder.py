@@ -245,6 +245,10 @@ class Builder:
                 return other
             if kind == "b" and op in ("and", "or") and one.is_all(op == "or"):
                 return one
+        if op == "add" and kind == "f":
+            zeros = [self.zeros.of(one) for one in (x, y)]
+            if np.logical_or(*zeros).all():
+                return self.view([x, y], zeros[0].astype(int).reshape(x.shape), x.places)
         same = {"sub": 0, "div": 1}
         return x if op in same and isinstance(y, Const) and y.is_all(same[op]) else None
 
