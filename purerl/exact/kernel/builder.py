@@ -220,6 +220,7 @@ class Builder:
             depth += 1
         new.block = self.blocks[depth]
         new.block.known[key] = new
+        self.zeros.of(new)  # now, when those of all that it reads are known
         if not free:
             new.block.items.append(new)
         return new
