@@ -1,8 +1,8 @@
 """Makes values: each once, in the outermost place where it can be, and only what depends on inputs.
 
-What follows from constants is computed here, by numpy. A product with nothing but zeros is zero: of
-a state that is not finite, 0 * NaN would be NaN. MJX multiplies the world's Jacobian, all zeros,
-with most things; a state with NaN keeps NaN in all that is not such a product.
+What follows from constants is computed here, by numpy. A product with a constant zero is zero: of a
+state that is not finite, 0 * NaN would be NaN. MJX multiplies the world's Jacobian, all zeros, with
+most things, and Jacobians by masks; a state with NaN keeps NaN in all that is not such a product.
 """
 
 import contextlib
@@ -19,8 +19,9 @@ from purerl.exact.kernel.zeros import Zeros
 SMALL = 256  # numbers: what is larger is not kept beyond its block to be computed once
 FEW_TERMS = 4  # a row of so few is written out, each term where it is needed
 MOST_WRITTEN_OUT = 1 << 17
-# A sum of so many terms, in all rows, is made without those that are known to be 0, if only one in
-# so many is not. Rows that are made one fold have at least this share of the longest one's terms.
+# Sums of so many terms, in all rows, are made without those that are known to be 0, if only one in
+# so many is not. Of the rows that are made one fold, each has more than this share of the longest
+# one's terms: with fewer zeros than before, it is not made without them again.
 MANY_TERMS, MANY_ZEROS, SHORTEST = 4096, 2, 0.6
 FEW = 4  # numbers: one of so few is chosen, one of more is read from memory
 # What a fold of nothing gives.

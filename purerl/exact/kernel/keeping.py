@@ -1,8 +1,10 @@
 """Which values stand in memory, and which are computed anew wherever they are read.
 
-A map that is read once becomes a part of what reads it. One that is read more often is kept, unless
-it is so cheap that reading it costs as much as computing it. Terms of a sum that lanes share are
-computed in the sum's own loop: there they would only take memory and a statement more.
+A map becomes a part of the statements that read it, if none of its numbers is computed twice then.
+Another is kept, unless it is so cheap that reading it costs as much as computing it. Terms of a sum
+that lanes share are computed in the sum's own loop: there they would only take memory and a
+statement more. Of what is kept only those numbers stand in memory that anything reads, and of a
+large value only those that are not known to be 0.
 """
 
 import collections
@@ -153,7 +155,7 @@ def _uses(top: Block, outputs: list[Value], items: list[Any], repeated: set[Valu
 
 def _not_repeated(uses: Uses, items: list[Any]) -> set[Value]:
     """Stops keeping what is cheap; returns what is not kept and would be computed too often."""
-    found = set()
+    found = set[Value]()
     for item in items:
         if isinstance(item, Map) and uses.sites[item]:
             cost = OPERATIONS[item.op].cost + sum(_cost(x, uses) for x in item.args)

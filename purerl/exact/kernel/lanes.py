@@ -6,6 +6,7 @@ device, and in the C++ of one lane.
 - A row of terms that the lanes share: lane l adds terms l, l + 32, l + 64, ... in this order; then
   lanes l and l + 16 are added, l and l + 8, and so on down to l + 1.
 - Any other row, from its first term to its last.
+- Terms that are known to be 0 may be left out of a row (`Builder._packed`): what is left is a row.
 """
 
 import math

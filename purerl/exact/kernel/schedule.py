@@ -88,7 +88,9 @@ class Scheduler:
         copied = zip(keeping.copied_by(step), step.writes, strict=False)
         copies = [(home(x), self._copy(value)) for value, x in copied if x.size]
         plans, which = [], None
-        matrices = [self.home(x) for x in step.reads[:-1]] if isinstance(step, values.Linear) else []
+        matrices: list[Value] = []
+        if isinstance(step, values.Linear):
+            matrices = [self.home(x) for x in step.reads[:-1]]
         if isinstance(step, values.Loop):
             in_step = in_step and step.rounds is not None
             if step.test:

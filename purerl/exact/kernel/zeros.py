@@ -7,9 +7,9 @@ import numpy as np
 
 from purerl.exact.kernel.values import Const, Fold, Map, Value, View
 
-# What gives 0 of nothing but zeros. A select's zeros are of both its sides, a product's of one.
-ZERO_OF_ZEROS = """abs add add_any and convert_element_type copy max min mul neg or select_n sign
-sin sqrt square sub tan""".split()  # noqa: SIM905
+# What gives 0 of nothing but zeros; a select's zeros are of its sides.
+OF_ZEROS = {"abs", "add", "convert_element_type", "copy", "max", "min", "neg", "select_n", "sign"}
+OF_ZEROS |= {"sin", "sqrt", "square", "sub", "tan"}
 
 
 class Zeros:
@@ -36,8 +36,9 @@ class Zeros:
             return found
         if isinstance(value, Fold) and value.op == "add":
             return self.of(value.arg).reshape(-1, value.terms).all(1)
-        if isinstance(value, Map) and value.op in ZERO_OF_ZEROS:
-            args = value.args[1:] if value.op == "select_n" else value.args
-            join = np.any if value.op == "mul" else np.all
-            return join([self.of(arg) for arg in args], 0)
+        if isinstance(value, Map) and value.op == "mul":
+            return self.of(value.args[0]) | self.of(value.args[1])
+        if isinstance(value, Map) and value.op in OF_ZEROS:
+            sides = value.args[1:] if value.op == "select_n" else value.args
+            return np.stack([self.of(side) for side in sides]).all(0)
         return np.zeros(value.size, bool)
