@@ -35,10 +35,10 @@ class Zeros:
                 found[here] = self.of(source)[value.index[here]]
             return found
         if isinstance(value, Fold) and value.op == "add":
-            return self.of(value.arg).reshape(-1, value.terms).all(1)
+            return self.of(value.arg).reshape(-1, value.terms).min(1)
         if isinstance(value, Map) and value.op == "mul":
             return self.of(value.args[0]) | self.of(value.args[1])
         if isinstance(value, Map) and value.op in OF_ZEROS:
             sides = value.args[1:] if value.op == "select_n" else value.args
-            return np.stack([self.of(side) for side in sides]).all(0)
+            return np.stack([self.of(side) for side in sides]).min(0)  # all of them
         return np.zeros(value.size, bool)
