@@ -1,8 +1,8 @@
 """Makes values: each once, in the outermost place where it can be, and only what depends on inputs.
 
-What follows from constants is computed here, by numpy. A product with nothing but zeros is zero: of
-a state that is not finite, 0 * NaN would be NaN. MJX multiplies the world's Jacobian, all zeros,
-with most things; a state with NaN keeps NaN in all that is not such a product.
+What follows from constants is computed here, by numpy. A product with a constant zero is zero: of a
+state that is not finite, 0 * NaN would be NaN. MJX multiplies the world's Jacobian, all zeros, with
+most things, and Jacobians by masks; a state with NaN keeps NaN in all that is not such a product.
 """
 
 import contextlib
@@ -14,10 +14,15 @@ import numpy as np
 from purerl.exact.kernel import lanes, values
 from purerl.exact.kernel.operations import computed
 from purerl.exact.kernel.values import DTYPES, Const, Held, Map, Value, View, kind_of
+from purerl.exact.kernel.zeros import Zeros
 
 SMALL = 256  # numbers: what is larger is not kept beyond its block to be computed once
 FEW_TERMS = 4  # a row of so few is written out, each term where it is needed
-MOST_WRITTEN_OUT = 8192
+MOST_WRITTEN_OUT = 1 << 17
+# Sums of so many terms, in all rows, are made without those that are known to be 0, if only one in
+# so many is not. Of the rows that are made one fold, each has more than this share of the longest
+# one's terms: with fewer zeros than before, it is not made without them again.
+MANY_TERMS, MANY_ZEROS, SHORTEST = 4096, 2, 0.6
 FEW = 4  # numbers: one of so few is chosen, one of more is read from memory
 # What a fold of nothing gives.
 NOTHING = {"add": 0, "mul": 1, "or": 0, "and": 1, "max": -np.inf, "min": np.inf}
@@ -30,6 +35,7 @@ class Builder:
         """Begins a kernel."""
         self.top = values.Block("top")
         self.blocks = [self.top]
+        self.zeros = Zeros()
         self._constants: dict[Any, Const] = {}
 
     @contextlib.contextmanager
@@ -130,7 +136,35 @@ class Builder:
         new = values.Fold(shape, arg.kind, self.top, op, arg, terms)
         new.width = lanes.width_of(new)
         new.shared = lanes.are_shared(new)
-        return self._once(("fold", op, id(arg), shape), new, [arg])
+        packed = None if new.width else self._packed(new)
+        return packed or self._once(("fold", op, id(arg), shape), new, [arg])
+
+    def _packed(self, fold: values.Fold) -> Value | None:
+        """Returns a fold without most of its terms that are known to be 0; None if they are few.
+
+        Rows of about as many other terms are made one fold. Of a symmetric square, which a Hessian
+        is, the upper half is the lower one.
+        """
+        if fold.op != "add" or fold.arg.size < MANY_TERMS:
+            return None
+        zero = self.zeros.of(fold.arg).reshape(fold.size, fold.terms)
+        counts = fold.terms - zero.sum(1)
+        if MANY_ZEROS * counts.sum() > fold.arg.size:
+            return None
+        order, terms = np.argsort(zero, 1, kind="stable"), fold.arg.places.reshape(zero.shape)
+        n = lanes.width_of(fold, fold.size)
+        rows = np.arange(fold.size)
+        mirrored = rows % n * n + rows // n if n else rows
+        rows, counts = np.maximum(rows, mirrored), np.where(rows < mirrored, 0, counts)
+        parts: list[Value] = [self.const(np.zeros(1, DTYPES[fold.kind]))]
+        which, index = np.zeros(fold.size, int), np.zeros(fold.size, int)
+        while (most := counts.max()) > 0:
+            (some,) = np.nonzero(counts > SHORTEST * most)
+            which[some], index[some] = len(parts), np.arange(len(some))
+            places = terms[some[:, None], order[some, :most]]
+            parts.append(self.fold("add", self.pick(fold.arg, places), (len(some),)))
+            counts[some] = 0
+        return self.view(parts, which[rows].reshape(fold.shape), index[rows].reshape(fold.shape))
 
     def take(self, value: Value, index: np.ndarray) -> Value:
         """Returns the numbers at places, in the shape of `index`."""
@@ -187,6 +221,7 @@ class Builder:
             depth += 1
         new.block = self.blocks[depth]
         new.block.known[key] = new
+        self.zeros.of(new)  # now, when those of all that it reads are known
         if not free:
             new.block.items.append(new)
         return new
@@ -212,6 +247,10 @@ class Builder:
                 return other
             if kind == "b" and op in ("and", "or") and one.is_all(op == "or"):
                 return one
+        if op == "add" and kind == "f":
+            zeros = [self.zeros.of(one) for one in (x, y)]
+            if np.logical_or(*zeros).all():
+                return self.view([x, y], zeros[0].astype(int).reshape(x.shape), x.places)
         same = {"sub": 0, "div": 1}
         return x if op in same and isinstance(y, Const) and y.is_all(same[op]) else None
 

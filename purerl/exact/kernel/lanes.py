@@ -6,6 +6,7 @@ device, and in the C++ of one lane.
 - A row of terms that the lanes share: lane l adds terms l, l + 32, l + 64, ... in this order; then
   lanes l and l + 16 are added, l and l + 8, and so on down to l + 1.
 - Any other row, from its first term to its last.
+- Terms that are known to be 0 may be left out of a row (`Builder._packed`): what is left is a row.
 """
 
 import math
@@ -25,11 +26,14 @@ def are_shared(fold: Fold) -> bool:
     return fold.terms >= LANES and (fold.size <= FEW_ROWS or fold.width > 0)
 
 
-def width_of(fold: Fold) -> int:
-    """Returns n if the rows are an [n, n] of sums of products that is symmetric, else 0."""
+def width_of(fold: Fold, widest: int = WIDEST) -> int:
+    """Returns n if the rows are an [n, n] of sums of products that is symmetric, else 0.
+
+    It is 0, too, if n is more than `widest`.
+    """
     n = math.isqrt(fold.size)
     products = isinstance(fold.arg, Map) and fold.arg.op == "mul" and fold.op == "add"
-    if not products or n * n != fold.size or not 1 < n <= WIDEST:
+    if not products or n * n != fold.size or not 1 < n <= widest:
         return 0
     factors = list(_factors(fold.arg, np.arange(fold.arg.size)))
     ids, index = (np.stack(parts, -1) for parts in zip(*factors, strict=True))

@@ -12,6 +12,7 @@ from purerl.exact.kernel import values
 from purerl.exact.kernel.builder import Builder
 from purerl.exact.kernel.rules import RULES
 from purerl.exact.kernel.values import Block, Const, Held, NoRuleError, Value
+from purerl.exact.kernel.zeros import Zeros
 
 
 class Program(NamedTuple):
@@ -20,6 +21,7 @@ class Program(NamedTuple):
     block: Block
     inputs: list[Held]
     outputs: list[Value]
+    zeros: Zeros
 
 
 class Missing(NamedTuple):
@@ -50,7 +52,7 @@ def missing(closed: core.ClosedJaxpr) -> list[Missing]:
 def _read(closed: core.ClosedJaxpr, refuse: Callable[[Missing], None]) -> Program:
     reader = _Reader(refuse)
     inputs = [reader.build.held(v.aval.shape, v.aval.dtype) for v in closed.jaxpr.invars]
-    return Program(reader.build.top, inputs, reader.run(closed, *inputs))
+    return Program(reader.build.top, inputs, reader.run(closed, *inputs), reader.build.zeros)
 
 
 class _Reader:

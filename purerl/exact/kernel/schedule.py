@@ -1,7 +1,7 @@
 """From values to statements, in levels: no statement of a level reads what another of it writes."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,14 @@ from purerl.exact.kernel.values import Block, Const, Fold, Held, Map, Value, Vie
 Pairs = Sequence[tuple[Value, Held]]
 
 
+class _Row(NamedTuple):
+    """The numbers of a value that stand in memory: those that are read."""
+
+    home: Held
+    places: np.ndarray
+    ranks: np.ndarray  # of each number of the value its place in `home`, or -1
+
+
 class Scheduler:
     """Writes the statements of one program: `plan`, the homes of its `outputs`, and `slots`."""
 
@@ -21,10 +29,17 @@ class Scheduler:
         """Decides what is kept, and plans all blocks."""
         # Single constants that stand in memory, each by its bits.
         self.slots: dict[int, int] = {}
-        self.keep = keeping.kept(program.block, program.outputs)
+        self.keep = {
+            x: _Row(Held(places.shape, x.kind, x.block), places, _ranks(places, x.size))
+            for x, places in keeping.kept(program.block, program.outputs, program.zeros).items()
+        }
         self.outputs = [Held(x.shape, x.kind, program.block) for x in program.outputs]
         pairs = list(zip(program.outputs, self.outputs, strict=True))
         self.plan = self._plan(program.block, pairs, True)
+
+    def home(self, value: Value) -> Value:
+        """Returns the value in whose memory a value stands."""
+        return self.keep[value].home if value in self.keep else home(value)
 
     def code(self, value: Value, places: np.ndarray) -> Code:
         """Returns the code of a value's numbers at places, [...]."""
@@ -42,7 +57,7 @@ class Scheduler:
                 made.append(self._statement(item))
         copies, homes = [], {home(x) for _, x in pairs}
         for value, target in pairs:
-            if home(value) is home(target) or not value.size:
+            if self.home(value) is home(target) or not value.size:
                 continue
             code = self._copy(value)
             if code.reads() & homes:
@@ -60,17 +75,22 @@ class Scheduler:
         return self.code(value, np.arange(value.size))
 
     def _statement(self, item: Map | Fold) -> Statement:
+        row = self.keep[item]
         if isinstance(item, Fold):
-            code = self.code(item.arg, np.arange(item.arg.size).reshape(-1, item.terms))
-            return Statement([item], code, item.op, item.terms, item.shared)
+            code = self.code(item.arg, item.arg.places.reshape(-1, item.terms)[row.places])
+            width = item.width if len(row.places) == item.size else 0
+            return Statement([row.home], code, item.op, item.terms, item.shared, width)
         code = Code()
-        code.result = _Expression(self, code).compute(item, np.arange(item.size))
-        return Statement([item], code)
+        code.result = _Expression(self, code).compute(item, row.places)
+        return Statement([row.home], code)
 
     def _step(self, step: values.Step, in_step: bool) -> StepStatement:
         copied = zip(keeping.copied_by(step), step.writes, strict=False)
         copies = [(home(x), self._copy(value)) for value, x in copied if x.size]
         plans, which = [], None
+        matrices: list[Value] = []
+        if isinstance(step, values.Linear):
+            matrices = [self.home(x) for x in step.reads[:-1]]
         if isinstance(step, values.Loop):
             in_step = in_step and step.rounds is not None
             if step.test:
@@ -81,7 +101,7 @@ class Scheduler:
             which = self._copy(step.reads[0])
             for block, results in zip(step.branches, step.results, strict=True):
                 plans.append(self._plan(block, [*zip(results, step.writes, strict=True)], False))
-        return StepStatement(step, copies, plans, which)
+        return StepStatement(step, copies, plans, which, matrices)
 
     def slots_of(self, constant: Const, index: np.ndarray) -> np.ndarray:
         """Returns the slots of a constant's numbers."""
@@ -90,6 +110,12 @@ class Scheduler:
         distinct, inverse = np.unique(memory.view(np.uint32), return_inverse=True)
         slots = [self.slots.setdefault(int(x), len(self.slots)) for x in distinct]
         return np.array(slots, np.int64)[inverse]
+
+
+def _ranks(places: np.ndarray, size: int) -> np.ndarray:
+    found = np.full(size, -1)
+    found[places] = np.arange(len(places))
+    return found
 
 
 class _Expression:
@@ -107,15 +133,14 @@ class _Expression:
             first = int(which.flat[0])
             if (which == first).all():
                 return self.add(value.sources[first], index)
-            return self._mixed(value, which, index)
+            return self._standing(value.sources, which, index)
         key = id(value), places.tobytes()
         if key not in self.known:
             if isinstance(value, Const):
                 numbers = value.array.reshape(-1)[places]
                 self.known[key] = self._leaf(Leaf(value.kind, (), places, numbers))
             elif isinstance(value, Held) or value in self.scheduler.keep:
-                leaf = Leaf(value.kind, (home(value),), np.zeros_like(places), places)
-                self.known[key] = self._leaf(leaf)
+                self.known[key] = self._standing([value], np.zeros_like(places), places)
             else:
                 assert isinstance(value, Map), "a fold is kept"
                 self.known[key] = self.compute(value, places)
@@ -127,19 +152,27 @@ class _Expression:
         param = value.param
         if value.op == "lookup":
             param = len(self.into.tables)
-            self.into.tables.append(value.param)
+            self.into.tables.append(self.scheduler.home(value.param))
         self.into.lines.append(Line(value.op, value.kind, param, args))
         return len(self.into.lines) - 1
 
-    def _mixed(self, value: View, which: np.ndarray, index: np.ndarray) -> int:
-        """Returns the leaf for numbers of several values, all of which stand in memory."""
-        index, sources = index.copy(), []
-        for number, source in enumerate(value.sources):
-            here = which == number
+    def _standing(self, sources: Sequence[Value], which: np.ndarray, index: np.ndarray) -> int:
+        """Returns the leaf for numbers of values that stand in memory (see `View`)."""
+        homes: list[Value] = [SLOTS]
+        group, at = np.zeros_like(index), np.empty_like(index)
+        for number in np.unique(which):
+            here, source = which == number, sources[number]
             if isinstance(source, Const):
-                index[here] = self.scheduler.slots_of(source, index[here])
-            sources.append(SLOTS if isinstance(source, Const) else home(source))
-        return self._leaf(Leaf(value.kind, tuple(sources), which, index))
+                at[here] = self.scheduler.slots_of(source, index[here])
+                continue
+            row = self.scheduler.keep.get(source)
+            at[here] = row.ranks[index[here]] if row else index[here]
+            group[here] = len(homes)
+            homes.append(self.scheduler.home(source))
+        if (at < 0).any():  # known to be 0
+            group[at < 0] = 0
+            at[at < 0] = self.scheduler.slots.setdefault(0, len(self.scheduler.slots))
+        return self._leaf(Leaf(sources[0].kind, tuple(homes), group, at))
 
     def _leaf(self, leaf: Leaf) -> int:
         self.into.leaves.append(leaf)

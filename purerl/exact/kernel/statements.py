@@ -67,6 +67,7 @@ class Statement:
     fold: str = ""  # the operation between terms
     terms: int = 1
     shared: bool = False  # whether the lanes share each row
+    width: int = 0  # n if the rows are a symmetric square [n, n] of shared sums
     waits = True  # it may run as late as it can
 
     @property
@@ -87,7 +88,12 @@ class StepStatement:
     copies: list[tuple[Value, Code]]
     plans: list["Plan"]
     which: Code | None = None  # of a choice: the number of the branch
-    waits = False  # what it computes is needed by most of what follows
+    matrices: Sequence[Value] = ()  # of a solve: where its matrix stands
+
+    @property
+    def waits(self) -> bool:
+        """Tells whether it may run late: most of what follows needs what loops compute."""
+        return isinstance(self.step, values.Linear)
 
     @property
     def writes(self) -> list[Value]:
@@ -97,8 +103,7 @@ class StepStatement:
     def reads(self) -> set[Value]:
         """Returns what has to stand in memory before it, by its home."""
         found = read_by(self.copies).union(*(plan.outside for plan in self.plans))
-        if isinstance(self.step, values.Linear):
-            found |= {home(x) for x in self.step.reads[:-1]}
+        found |= set(self.matrices)
         return (found | (self.which.reads() if self.which else set())) - set(self.writes)
 
 

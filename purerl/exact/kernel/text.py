@@ -12,7 +12,7 @@ from purerl.exact.kernel.lanes import LANES
 from purerl.exact.kernel.reading import Program
 from purerl.exact.kernel.schedule import Scheduler
 from purerl.exact.kernel.statements import Code, Plan, Statement, StepStatement
-from purerl.exact.kernel.values import Choice, Fold, Linear, Loop, NoRuleError, Value, home
+from purerl.exact.kernel.values import Choice, Linear, Loop, NoRuleError, Value, home
 
 # What follows is of the fastest build on an H200 (lab/2026-11-29-one-kernel-on-a-cpu.md).
 LOCKSTEP = 4  # levels from one barrier of a block to the next: its warps share fetched code
@@ -180,7 +180,7 @@ class _Writer(Cells):
         yield "SYNC;"
         step = statement.step
         if isinstance(step, Linear):
-            yield self._linear(step)
+            yield self._linear(step, statement.matrices)
         elif isinstance(step, Choice):
             yield from self._choice(statement)
         else:
@@ -214,12 +214,12 @@ class _Writer(Cells):
         lines, result = self.code(code, [self.leaf(leaf, "0") for leaf in code.leaves])
         return f"int which; {{ {' '.join(lines)} which = UNIFORM({result}); }}"
 
-    def _linear(self, step: Linear) -> str:
+    def _linear(self, step: Linear, matrices: Sequence[Value]) -> str:
         (target,), n = step.writes, step.reads[0].shape[0]
         to = self.address[home(target)]
         if step.op == "cholesky":
             return f"cholesky<{n}>(P + {to}, lane);"
-        matrix = self.address[home(step.reads[0])]
+        matrix = self.address[matrices[0]]
         steps = f"1, {n}" if step.transposed else f"{n}, 1"
         forward = int(step.lower != step.transposed)
         return f"solve<{n}, {steps}, {forward}>(P + {matrix}, P + {to}, lane);"
@@ -229,20 +229,14 @@ def _shape(statement: Statement) -> tuple[str, int, str]:
     return statement.fold, statement.terms, statement.writes[0].kind
 
 
-def _width(statement: Statement) -> int:
-    """Returns n if a shared fold's rows are a symmetric [n, n], else 0."""
-    (fold,) = statement.writes
-    return fold.width if isinstance(fold, Fold) else 0
-
-
 def _distinct_rows(statement: Statement) -> list[int]:
     """Returns the rows to sum: of a symmetric square those of its lower half."""
-    n = _width(statement)
+    n = statement.width
     return [r * n + c for r in range(n) for c in range(r + 1)] or list(range(statement.size))
 
 
 def _mirrored(statement: Statement, row: int) -> int:
-    n = _width(statement)
+    n = statement.width
     return row % n * n + row // n if n else row
 
 

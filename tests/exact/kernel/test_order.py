@@ -2,13 +2,14 @@
 
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from purerl import exact
 from purerl.exact.kernel import lanes, reading, values
-from tests.exact.kernel import by_one_lane, needs_compiler
+from tests.exact.kernel import by_one_lane, by_warps, needs_compiler
 
 TERMS = np.random.default_rng(0).normal(size=(16, 100)).astype(np.float32)
 
@@ -54,9 +55,68 @@ def test_an_environments_bits_do_not_depend_on_how_many_there_are():
     assert all((x[0] == y[2]).all() for x, y in zip(alone, together, strict=True))
 
 
-def folds_of(function, *example):
-    import jax
+# Joints that move a contact: six of each, and four more of some.
+MOVED = np.zeros((150, 64), bool)
+MOVED[:, :6] = True
+for _row in range(0, 150, 2):
+    MOVED[_row, 6 + _row % 54 :][:4] = True
+ROWS = np.random.default_rng(1).normal(size=MOVED.shape).astype(np.float32)
 
+
+def jacobian(rows):
+    return jnp.where(rows > 9, 0.0, rows) * MOVED
+
+
+def square(rows, d):
+    return jacobian(rows).T @ (d[:, None] * jacobian(rows))
+
+
+@needs_compiler
+def test_terms_that_are_known_to_be_zero_are_left_out_of_a_sum():
+    kernel = exact.compile_kernel(lambda rows: jacobian(rows).sum(1), ROWS)
+    (found,) = by_one_lane(kernel.text, np.where(MOVED, ROWS, np.inf).reshape(1, -1))
+    assert (found[0] == [in_turn(r[m]) for r, m in zip(ROWS, MOVED, strict=True)]).all()
+    (fold, other) = folds_of(lambda rows: jacobian(rows).sum(1), ROWS)
+    assert {(fold.size, fold.terms), (other.size, other.terms)} == {(75, 6), (75, 10)}
+
+
+@needs_compiler
+def test_a_hessian_has_no_terms_that_are_known_to_be_zero_and_one_half(tmp_path):
+    d = np.linspace(0.5, 2, 150).astype(np.float32)
+    kernel = exact.compile_kernel(square, ROWS, d)
+    given = ROWS.reshape(1, -1), d[None]
+    (found,), (warps,) = (
+        by_one_lane(kernel.text, *given),
+        by_warps(kernel.text, *given, folder=tmp_path, environments=1),
+    )
+    assert (found.view(np.int32) == warps.view(np.int32)).all()
+    assert np.allclose(found.reshape(64, 64), square(ROWS, d), 1e-4, 1e-5)
+    assert (found.reshape(64, 64) == found.reshape(64, 64).T).all()
+    terms = sum(x.arg.size for x in folds_of(square, ROWS, d))
+    both = (MOVED[:, :, None] & MOVED[:, None, :]).sum()
+    assert both / 2 < terms < 0.9 * both, "each term once, and not above the diagonal"
+
+
+def test_known_zeros_are_zeros_and_all_that_are_to_be_found():
+    x, mask = ROWS[:6, :6], np.tri(6, dtype=np.float32)
+
+    def function(x):
+        y = x * mask
+        return {
+            "mul": y * x.T, "add": y + (y @ x) * mask.T * mask, "sub": -y - y, "sum": y.sum(0)[1:],
+            "select": jnp.where(x > 0, y, 2 * y), "view": jnp.concatenate([y[::-1], x]),
+            "sin": jnp.sin(y), "cos": jnp.cos(y), "div": y / x, "minus": y - x * mask.T,
+        }  # fmt: skip
+
+    program = reading.read(jax.make_jaxpr(function)(x))
+    above = int((mask == 0).sum())
+    wanted = dict.fromkeys(function(x), above) | {"sum": 0, "cos": 0, "minus": 0, "div": 0}
+    for (name, real), value in zip(sorted(function(x).items()), program.outputs, strict=True):
+        zero = program.zeros.of(value)
+        assert not np.ravel(real)[zero].any() and zero.sum() == wanted[name], name
+
+
+def folds_of(function, *example):
     program = reading.read(jax.make_jaxpr(function)(*example))
     return [x for x in program.block.items if isinstance(x, values.Fold)]
 

@@ -10,6 +10,8 @@ from jax import lax
 
 from purerl import exact
 from purerl.exact.kernel import levels, memory, reading, schedule, statements, values
+from purerl.exact.kernel.statements import Statement
+from tests.exact.kernel import by_one_lane, by_warps, needs_compiler
 
 X = np.ones(9, np.float32)
 
@@ -76,6 +78,68 @@ def test_a_loop_needs_what_it_reads_and_carries_until_it_ends():
     for value in {*loop.plans[-1].outside, *loop.writes}:
         assert clock.first[value] < min(clock.first[x] for x in inner)
         assert clock.last[value] > max(clock.last[x] for x in inner)
+
+
+def kept_of(function, *example):
+    """Returns the operations whose numbers stand in memory, and how many of them do."""
+    _, scheduler, _ = planned(function, *example)
+    return {(value.op, len(row.places)) for value, row in scheduler.keep.items()}
+
+
+LONG = np.linspace(0.1, 1, 40).astype(np.float32)
+
+
+def test_what_one_statement_computes_once_is_not_kept():
+    assert kept_of(lambda x: (y := jnp.sin(x)) * jnp.cos(y), LONG) == {("mul", 40)}
+    apart = kept_of(lambda x: (jnp.cos(jnp.sin(x)[:20]), jnp.exp(jnp.sin(x)[20:])), LONG)
+    assert apart == {("cos", 20), ("exp", 20)}
+    assert ("sin", 40) in kept_of(lambda x: jnp.sin(x) * jnp.sin(x)[::-1], LONG), "twice"
+
+
+def test_of_what_two_statements_read_only_what_they_read_is_kept():
+    def function(x):
+        y = jnp.sin(x)
+        return jnp.cos(y[:30]), jnp.exp(y[10:30]), jnp.cos(y[::-1])[10:] + 1
+
+    assert kept_of(lambda x: function(x)[:2], LONG) == {("sin", 30), ("cos", 30), ("exp", 20)}
+    assert ("sin", 30) in kept_of(function, LONG)
+
+
+BAND = np.abs(np.subtract.outer(np.arange(60), np.arange(60))) < 3
+
+
+def masked(x):
+    y = jnp.sin(x)[:, None] * BAND  # its square and its products would all be computed anew
+    solved = jax.scipy.linalg.solve_triangular(y + 9 * np.eye(60, dtype=np.float32), x, lower=True)
+    return y @ y, jnp.cos(y)[::2].sum(), solved, (2 * y)[jnp.int32(50 * x[0])]  # of whole rows
+
+
+@needs_compiler
+def test_known_zeros_of_a_large_value_take_no_memory(tmp_path):
+    x = np.linspace(0.1, 1, 60).astype(np.float32)
+    assert ("mul", BAND.sum()) in kept_of(masked, x)
+    kernel = exact.compile_kernel(masked, x)
+    one = by_one_lane(kernel.text, x[None])
+    wanted = jax.tree.leaves(masked(x))
+    assert all(np.allclose(a, np.ravel(b), 1e-4, 1e-6) for a, b in zip(one, wanted, strict=True))
+    warps = by_warps(kernel.text, x[None], folder=tmp_path, environments=1)
+    assert all(
+        (a.view(np.int32) == b.view(np.int32)).all() for a, b in zip(one, warps, strict=True)
+    )
+
+
+def test_a_linear_system_whose_result_is_needed_late_waits():
+    def function(x):
+        solved = lambda a, b: jax.scipy.linalg.solve_triangular(a, b, lower=True)  # noqa: E731
+        factor = lambda x: jnp.linalg.cholesky(jnp.outer(x, x) + np.eye(16))  # noqa: E731
+        first = factor(x)
+        return solved(first, jnp.sort(jnp.sort(solved(factor(2 * x), x))))
+
+    _, scheduler, clock = planned(function, np.ones(16, np.float32))
+    steps = [x for level in scheduler.plan.levels for x in level if not isinstance(x, Statement)]
+    ends = [x.writes[0] for x in steps if x.step.op == "cholesky"]
+    first, second = sorted((clock.first[x], clock.last[x]) for x in ends)
+    assert first[1] < second[0], "one is no longer needed when the other is made"
 
 
 def test_values_that_are_needed_at_once_do_not_share_memory():
