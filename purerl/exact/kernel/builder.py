@@ -48,6 +48,8 @@ class Builder:
 
     def const(self, array: Any, dtype: Any = None) -> Const:
         """Returns a constant."""
+        if not isinstance(getattr(array, "dtype", np.dtype(int)), np.dtype):
+            kind_of(array.dtype)  # raises: no array of numpy has keys
         array = np.asarray(array, dtype)
         kind = "f" if array.dtype == np.float64 else kind_of(array.dtype)
         array = np.ascontiguousarray(array, DTYPES[kind]).reshape(array.shape)

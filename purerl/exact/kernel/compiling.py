@@ -20,7 +20,7 @@ class Kernel:
 
     text: text.Text
     shapes: Any  # of the results, a pytree
-    inputs: tuple[Any, list]  # the arguments' pytree, and the shape of each leaf
+    inputs: tuple[Any, list]  # the arguments' pytree, and of each leaf as float32[3]
 
     @property
     def source(self) -> str:
@@ -33,7 +33,7 @@ class Kernel:
         A loop of `vmap` makes of it one launch, with a warp for each environment.
         """
         leaves, tree = jax.tree.flatten(args)
-        if (given := (tree, [np.shape(x) for x in leaves])) != self.inputs:
+        if (given := (tree, [_words(x) for x in leaves])) != self.inputs:
             raise ValueError(f"The arguments are {given}; the kernel is for {self.inputs}.")
         kinds = [launch.DTYPES[kind] for _, kind in self.text.inputs]
         some = [jnp.asarray(x) for x in leaves if np.size(x)]
@@ -95,7 +95,13 @@ def _traced(f: Callable, *example: Any) -> tuple[core.ClosedJaxpr, Any, Any]:
     leaves, tree = jax.tree.flatten(example)
     flat = lambda *leaves: f(*jax.tree.unflatten(tree, leaves))  # noqa: E731
     closed, shapes = jax.make_jaxpr(flat, return_shape=True)(*leaves)
-    return closed, (tree, [np.shape(x) for x in leaves]), shapes
+    return closed, (tree, [_words(x) for x in leaves]), shapes
+
+
+def _words(x: Any) -> str:
+    """Returns what JAX makes of an argument, as float32[3]."""
+    found = jax.eval_shape(lambda x: x, x)
+    return f"{found.dtype}{list(found.shape)}"
 
 
 def kernel_agreement(kernel: Kernel, f: Callable, *args: Any) -> Agreement:

@@ -51,7 +51,7 @@ def missing(closed: core.ClosedJaxpr) -> list[Missing]:
 
 def _read(closed: core.ClosedJaxpr, refuse: Callable[[Missing], None]) -> Program:
     reader = _Reader(refuse)
-    inputs = [reader.build.held(v.aval.shape, v.aval.dtype) for v in closed.jaxpr.invars]
+    inputs = [reader.argument(v.aval) for v in closed.jaxpr.invars]
     return Program(reader.build.top, inputs, reader.run(closed, *inputs), reader.build.zeros)
 
 
@@ -60,15 +60,35 @@ class _Reader:
 
     def __init__(self, refuse: Callable[[Missing], None]):
         self.build, self.refuse = Builder(), refuse
+        self.caller = ""  # the line that called the function of JAX which is read
+
+    def argument(self, aval: Any) -> Held:
+        """Returns what an argument of the trace is in the kernel."""
+        try:
+            return self.build.held(aval.shape, aval.dtype)
+        except NoRuleError as error:
+            self.refuse(Missing("an argument", str(error), "its caller"))
+            return self._unknown(aval)
+
+    def _constant(self, array: Any, dtype: Any = None) -> Value:
+        try:
+            return self.build.const(array, dtype)
+        except NoRuleError as error:
+            self.refuse(Missing("a constant", str(error), self.caller or "the function itself"))
+            return self.build.held(np.shape(array), np.int32)
 
     def run(self, closed: core.ClosedJaxpr, *args: Value) -> list[Value]:
         """Returns a trace's results."""
-        return traces.evaluate(closed, self._equation, self.build.const, *args)
+        return traces.evaluate(closed, self._equation, self._constant, *args)
 
     def _equation(self, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
-        name = eqn.primitive.name
+        name, source = eqn.primitive.name, traces.source(eqn)
+        source = self.caller or source if "/jax/_src/" in source else source
         if name in traces.CALLS:
-            return self.run(traces.sub_jaxprs(eqn)[0], *args)
+            caller, self.caller = self.caller, source
+            results = self.run(traces.sub_jaxprs(eqn)[0], *args)
+            self.caller = caller
+            return results
         try:
             if name in _CONTROL:
                 return _CONTROL[name](self, eqn, *args)
@@ -79,17 +99,17 @@ class _Reader:
                 with jax.ensure_compile_time_eval(), constants.on_cpu():
                     arrays = [jax.device_put(x.array) for x in args]
                     results = traces.bind_equation(eqn, *arrays)
-                return [self.build.const(np.asarray(x)) for x in results]
+                return [self.build.const(x) for x in results]
             why = ""
         except NoRuleError as error:
             why = str(error)
-        self.refuse(Missing(name, why, traces.source(eqn)))
+        self.refuse(Missing(name, why, source))
         return [self._unknown(v.aval) for v in eqn.outvars]
 
     def _unknown(self, aval: Any) -> Held:
         """Returns what stands for a result that has no rule, while all of these are listed."""
         kinds = {"b": np.bool_, "f": np.float32}
-        return self.build.held(aval.shape, kinds.get(np.dtype(aval.dtype).kind, np.int32))
+        return self.build.held(aval.shape, kinds.get(getattr(aval.dtype, "kind", ""), np.int32))
 
     def _round(self, role: str, carry: Sequence[Held], closed: Any, consts: Any) -> tuple:
         """Returns a block that runs a trace on the carry, and its results."""
