@@ -39,8 +39,8 @@ class Options:
     end_effectors: tuple[str, ...] = ()
     """Bodies where limbs end; (): those of a body that is known. An MJCF's own must be named."""
     clips: str = ""
-    """Path of an HDF5 file; rodent: twenty that come with purerl; cmu: two of a humanoid, 0.45 s;
-    squats: a computed one of it."""
+    """Path of an HDF5 file; rodent, ant: a set that comes with purerl; cmu: two of a humanoid, of
+    0.45 s; squats: a computed one of it."""
     clip_set: str = "all"
     """all, train, test (by their names), a behaviour, one clip, or of one part: test/Run."""
     held_out: float = 0.2

@@ -2,9 +2,9 @@ r"""An ant that has learned to move from recordings learns to cross gaps.
 
 python -m purerl.run ant_gaps_reuse --parts.decoder.run RUN --parts.prior.run RUN
 
-RUN is one of `ant_intention`. Expected: EXPECTED
-
-`rodent_gaps_reuse` is the same of a rodent, and tells of the network.
+RUN is one of `ant_intention`. Expected: 10 to 12 gaps after 0.1 M steps, in the first minute, where
+`ant_gaps` has 2 to 3; 15 to 16 of 19 after 1.5 M, where that has 17 to 18. Three seeds, a CPU core
+each. `rodent_gaps_reuse` is the same of a rodent, and tells of the network.
 """
 
 import dataclasses

@@ -1,10 +1,11 @@
-"""Asks a policy: `python -m purerl.ask RUN ... [--vary env.gap_length 0.1 0.2] [--lesion.layer L]`.
+r"""Asks a policy: `python -m purerl.ask RUN ... [--vary env.gap_length 0.1 0.2] [--lesion.layer L]`
 
 N whole episodes in other conditions than those it was trained in: with any option of its
 environment given, and at several values of one (a psychometric curve); with a lesion of its
 network; or both. All begin from the same keys, at each value, with the lesion and without:
 
-    python -m purerl.ask ant_gaps --env.arena single_gap --vary env.gap_length 0.1 0.3 0.5
+    python -m purerl.ask ant_gaps --env.arena single_gap --outcome landed_count \
+        --vary env.gap_length 0.1 0.3 0.5
     python -m purerl.ask ant_gaps --lesion.layer policy/Dense_0 --vary lesion.share 0 0.25 0.5 1
 
 Several runs, which differ in their seed alone, have a curve each, and one of their mean. RUN may be

@@ -54,7 +54,8 @@ def exists(module):
     return spec is not None
 
 
-EXPERIMENTS = ("ant_gaps", "custom_network", "suite", "rodent_gaps_reuse")  # of which pages tell
+# Of which pages tell.
+EXPERIMENTS = ("ant_gaps", "ant_intention", "custom_network", "suite", "ant_gaps_reuse")
 # Bodies, tasks and experiments are to be built upon: their modules are imported by name.
 OURS_BESIDE = ("purerl.envs", "purerl.experiments")
 
@@ -83,7 +84,7 @@ def unknown_options(words):
     module, *rest = words
     named = rest[: module in ("purerl.run", "purerl.plan", "purerl.view")]
     # These take what `run` takes, or the environment's part of it.
-    if module in ("purerl.check", "purerl.ask", "purerl.record"):
+    if module in ("purerl.check", "purerl.ask", "purerl.record", "purerl.render"):
         return [w for w in unknown_options(["purerl.run", *rest]) if w not in help_page(module)]
     page = help_page(module, *(re.sub(r"^runs/(\w+)/.*", r"\1", name) for name in named))
     return [word for word in options(rest) if not re.search(rf"{re.escape(word)}\b", page)]

@@ -52,7 +52,7 @@ def test_they_are_checked_cut_and_drawn_with_one(file, capsys, tmp_path, monkeyp
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["none.h5"], "none.h5 cannot be read: No such file or directory."),
+        (["none.h5"], "none.h5 cannot be read: No such file or directory (in /"),
         (["FILE", "--rate", "100"], "is of 50 Hz, not 100: leave the rate out."),
         (["FILE", *BODY, "--cut", "Roll_1", "0.5", "2"], "0.5 to 2 s is no part of it."),
         (["FILE", *BODY, "--cut", "Rol_1", "0.5", "2"], "no clip 'Rol_1'. Did you mean 'Roll_1'"),
