@@ -66,7 +66,7 @@ def command(words: Sequence[str]) -> None:
     setup, state = asking.acting(found.run, experiment, options)
     arrays = episode_arrays.record(setup, state, options.seed, options.episodes)
     about = {"run": found.name, "update": found.run.update, "digest": found.run.digest}
-    about["changes"] = asking.changes(found.run.experiment, experiment, options)
+    about["changes"] = "; ".join(asking.changes(found.run.experiment, experiment, options))
     write(options, arrays, setup.env, about)
     show(*(f"{name:32} {x.dtype} {list(x.shape)}" for name, x in arrays.items()), str(options.out))
 
