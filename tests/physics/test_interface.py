@@ -380,9 +380,9 @@ def test_no_scatter_sum_is_left_in_a_humanoid(jacobian):
     assert not exact.unordered_in(step_trace(model, rewritten=True))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_no_scatter_sum_is_left_in_a_rodent():
-    """Nor in an ant: `test_manifest.py` looks at a whole update of one."""
+    """70 s. Nor in an ant: `test_manifest.py` looks at a whole update of one."""
     env = run.build(run.Options(body="rodent"), engine="jax")
     assert not exact.unordered_in(step_trace(env.physics.model, True, run.READINGS))
 

@@ -177,8 +177,9 @@ def test_a_bodys_control_step_is_xlas(tmp_path, body, share, off):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_rodents_share_a_block():
+    """2 min."""
     physics = physics_of("rodent")
     one = jax.tree.map(lambda x: x[0], start(physics, ()))
     assert share_a_block(exact.compile_kernel(stepping(physics), *one)) >= 4
