@@ -23,7 +23,7 @@ from purerl.experiment.loading import Source, find_source
 from purerl.experiment.options import RunOptions, TrainOptions, check_seed
 from purerl.experiment.source_hashes import hash_code
 from purerl.machine import files, output, signals
-from purerl.runs import folder, manifest
+from purerl.runs import checkpoint_folder, folder, manifest
 from purerl.runs.loaded_run import Run
 
 
@@ -142,11 +142,11 @@ def as_begun(source: Source, over: command_line.Over) -> tuple[Experiment, RunOp
     if not options.resume or options.debug:
         return known
     place = next(iter(_folders(source, chosen, options)))
-    with contextlib.suppress(UserError):  # told where the folder is read as a run's
-        run = folder.read(place)
+    with contextlib.suppress(UserError, OSError):  # told where the folder is read as a run's
         # Without a checkpoint nothing was trained: a mistake in the command may have ended it.
-        if run.updates and hash_code(run.code) == hash_code(source.text):
-            begun = files.check_object("", run.config, settings=dict, schedule=dict)
+        trained = checkpoint_folder.updates(place / folder.CHECKPOINTS)
+        if trained and hash_code(files.read_bytes(place / folder.CODE)) == hash_code(source.text):
+            begun = files.read_json(place / folder.CONFIG, settings=dict, schedule=dict)
             schedule = files.check_object("", begun["schedule"], log_every=int, checkpoints=int)
             both = {name: schedule[name] for name in ("log_every", "checkpoints")}
             known = over(settings_json.from_json(source.experiment, begun["settings"]), **both)
