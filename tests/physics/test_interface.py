@@ -380,7 +380,7 @@ def test_no_scatter_sum_is_left_in_a_humanoid(jacobian):
     assert not exact.unordered_in(step_trace(model, rewritten=True))
 
 
-@pytest.mark.nightly
+@pytest.mark.slow
 def test_no_scatter_sum_is_left_in_a_rodent():
     """70 s. Nor in an ant: `test_manifest.py` looks at a whole update of one."""
     env = run.build(run.Options(body="rodent"), engine="jax")
