@@ -13,11 +13,10 @@ from pathlib import Path
 import pytest
 
 import purerl
-from purerl import run
+from purerl import render, run
 from purerl.core.errors import FAILURE, SUCCESS, USAGE, RunError, UserError
 from purerl.machine import command_errors, output
 from purerl.machine.files import write_answer
-from purerl.report import opengl
 from tests import quick
 from tests.training.test_run import ROOT, TOY, digest, folder, whole  # noqa: F401
 
@@ -164,17 +163,16 @@ def test_a_video_that_cannot_be_made_is_told_once(tmp_path, monkeypatch, capsys)
     def nothing_to_draw_with() -> str:
         raise RunError("There is no OpenGL to draw with.")
 
-    monkeypatch.setattr(opengl, "choose_gl", nothing_to_draw_with)
+    monkeypatch.setattr(run, "choose_gl", nothing_to_draw_with)
     assert run.main([str(TOY), "--runs", str(tmp_path), "--video"]) == SUCCESS
     assert capsys.readouterr().err.count("There is no video: There is no OpenGL") == 1
 
 
 def test_an_environment_that_cannot_be_drawn_is_told_by_its_public_name(tmp_path):
-    from purerl.report import video
-
     assert run.main([str(TOY), "--runs", str(tmp_path), "--ppo.num-steps", "32"]) == SUCCESS
+    trained = purerl.load(folder(tmp_path))
     with pytest.raises(UserError, match=r"no `physics` of the type purerl\.Physics\.$"):
-        video.make_video(purerl.load(folder(tmp_path)), "", 1, 1.0, (32, 32), 0)
+        render.make(trained, trained.experiment, render.RenderOptions())
     assert isinstance(purerl.Physics, type)
 
 
