@@ -63,14 +63,15 @@ def tried(name: str, job: Callable[[], Any], say: Callable[[Any], str] = str) ->
     return found
 
 
-def by_triton(ptx: str, text: Text, blocks: int, warps: int) -> tuple[str, dict[str, Any]]:
+def by_triton(ptx: str, text: Text, blocks: int, block: Any) -> tuple[str, dict[str, Any]]:
     """As `launch.by_xla`: the call of Pallas' Triton; jaxlib compiles the PTX and starts it.
 
     It adds pointers to scratch memory after the arrays; a kernel that declares none reads none.
     """
     from jax._src.lib import gpu_triton  # JAX has no public way
 
-    size, chip = 4 * text.memory * warps, launch.capability()
+    size, chip = 4 * text.memory * block.environments, launch.capability()
+    warps = block.environments * block.warps
     kernel = gpu_triton.TritonKernel("kernel", warps, 1, size, ptx, "", chip)
     arrays = 1 + len(text.inputs) + len(text.outputs)
     parameters = [gpu_triton.create_array_parameter(0, 4)] * arrays
@@ -260,9 +261,9 @@ def size_of(ptx: str) -> str:
 
 def describe(kernel: compiling.Kernel) -> str:
     """Says what a kernel needs."""
-    text, block = kernel.text, compilers.environments_of(kernel.text, launch.capability())
+    text, block = kernel.text, compilers.block_of(kernel.text, launch.capability())
     said = f"{text.statements} statements, {len(text.body):,} characters, "
-    return f"{said}{4 * text.memory:,} bytes an environment, {block} of them a block"
+    return f"{said}{4 * text.memory:,} bytes an environment, {block}"
 
 
 if __name__ == "__main__":

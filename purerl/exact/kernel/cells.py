@@ -21,7 +21,17 @@ class Cells:
         Args:
           address: where each value stands in memory, by its home.
         """
-        self.address, self.tables = address, indices.Tables()
+        self.address, self.tables, self.turn = address, indices.Tables(), 0
+
+    def each(self, size: int) -> str:
+        """Returns C that does something for each i; the warps of an environment take turns."""
+        turn, self.turn = self.turn, self.turn + -(-size // LANES)
+        return f"{'EACH' if size > LANES else 'FEW'}({turn}, i, {size})"
+
+    def one(self) -> str:
+        """Returns C that lets the warp whose turn it is do something alone."""
+        self.turn += 1
+        return f"ONE({self.turn - 1})"
 
     def memory(self, kind: str, place: str) -> str:
         """Returns C for a number in memory."""
@@ -83,17 +93,12 @@ class Cells:
     def assign(self, target: str, size: int, code: Code) -> str:
         """Returns C that computes numbers and puts them where `target` says."""
         lines, result = self.code(code, [self.leaf(leaf) for leaf in code.leaves])
-        return f"{each(size)} {{ {' '.join(lines)} {target} = {result}; }}"
+        return f"{self.each(size)} {{ {' '.join(lines)} {target} = {result}; }}"
 
     def copy(self, value: Value, code: Code, size: int = 0) -> str:
         """Returns C that computes numbers, by default a value's, and puts them where it stands."""
         target = self.memory(value.kind, f"{self.address[value]}+i")
         return self.assign(target, size or value.size, code)
-
-
-def each(size: int) -> str:
-    """Returns C that does something for each i."""
-    return f"EACH(i, {size})" if size > LANES else f"FEW(i, {size})"
 
 
 def _of_table(kind: str, place: str) -> str:

@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
@@ -25,27 +25,35 @@ GPU_WORDS = ("--std=c++17",)
 # Bytes of shared memory that a block can have, by compute capability; a chip that is not here has
 # at least what the smallest has.
 SHARED = {80: 163, 86: 99, 87: 163, 89: 99, 90: 227, 100: 227, 103: 227, 120: 99}
-MOST_ENVIRONMENTS = 16  # of a block: 512 threads, which may have 128 registers each
+MOST_WARPS = 16  # of a block: 512 threads, which may have 128 registers each
 
 
 class CompilerError(RuntimeError):
     """There is no compiler, or it has refused; the message says which and why."""
 
 
-def source(text: Text, environments: int = 1) -> str:
-    """Returns the whole text for a compiler.
+class Block(NamedTuple):
+    """How many environments a block of a GPU steps, and with how many warps each.
 
-    Args:
-      text: of the kernel.
-      environments: of a block, on a GPU.
+    Where few have room, more warps hide how long each has to wait. No bit depends on them.
     """
+
+    environments: int
+    warps: int = 1
+
+
+ALONE = Block(1)
+
+
+def source(text: Text, block: Block = ALONE) -> str:
+    """Returns the whole text for a compiler; `block` is for a GPU."""
     prelude = resources.files("purerl.exact.kernel").joinpath("prelude.h").read_text()
-    head = f"#define ENVIRONMENTS {environments}\n"
+    head = f"#define ENVIRONMENTS {block.environments}\n#define WARPS {block.warps}\n"
     return head + text.body.replace("PRELUDE\n", prelude, 1)
 
 
-def environments_of(text: Text, chip: int) -> int:
-    """Returns how many environments a block of a chip steps; CompilerError if it has no room."""
+def block_of(text: Text, chip: int) -> Block:
+    """Returns the block of a compute capability, as 90; CompilerError if it has no room."""
     room = SHARED.get(chip, min(SHARED.values())) * 1024
     fit = room // (4 * text.memory)
     if not fit:
@@ -53,7 +61,8 @@ def environments_of(text: Text, chip: int) -> int:
             f"A kernel needs {4 * text.memory:,} bytes of shared memory for an environment, and a "
             f"block of compute capability {chip / 10} has {room:,}: leave this step to XLA."
         )
-    return min(MOST_ENVIRONMENTS, fit)
+    environments = min(MOST_WARPS, fit)
+    return Block(environments, MOST_WARPS // environments)
 
 
 # --- C++ on this CPU ---
@@ -90,7 +99,7 @@ def for_gpu(text: Text, chip: int) -> str:
     library.nvrtcVersion(*map(ctypes.byref, version))
     words = (*GPU_WORDS, f"--gpu-architecture=compute_{chip}")
     numbers = tuple(str(x.value) for x in version)
-    whole = source(text, environments_of(text, chip))
+    whole = source(text, block_of(text, chip))
     return _kept(whole, (*numbers, *words), "ptx", lambda x: _ptx(library, x, words)).read_text()
 
 

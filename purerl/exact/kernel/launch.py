@@ -93,18 +93,20 @@ launched.def_abstract_eval(lambda number, *avals, text: _shapes(*avals, text=tex
 
 
 def _launch(ctx: Any, *nodes: Any, text: Text) -> Any:
-    """Lowers to a call of the kernel's PTX: a block for so many environments, a warp for each."""
+    """Lowers to a call of the kernel's PTX, with a block for so many environments."""
     number = int(np.prod(ctx.avals_in[1].shape[:-1], dtype=int))
     chip = capability()
-    warps = compilers.environments_of(text, chip)
-    name, config = by_xla(compilers.for_gpu(text, chip), text, -(-number // warps), warps)
+    block = compilers.block_of(text, chip)
+    blocks = -(-number // block.environments)
+    name, config = by_xla(compilers.for_gpu(text, chip), text, blocks, block)
     return jax.ffi.ffi_lowering(name, backend_config=config)(ctx, *nodes)
 
 
-def by_xla(ptx: str, text: Text, blocks: int, warps: int) -> tuple[str, dict[str, Any]]:
+def by_xla(ptx: str, text: Text, blocks: int, block: compilers.Block) -> tuple[str, dict[str, Any]]:
     """Returns XLA's own call of PTX: it starts it as one of its kernels, also in CUDA graphs."""
     words = {"name": "kernel", "kernel_type": "ptx", "kernel_data": ptx}
-    numbers = {"grid_x": blocks, "block_x": 32 * warps, "shared_mem_bytes": 4 * text.memory * warps}
+    numbers = {"grid_x": blocks, "block_x": 32 * block.environments * block.warps}
+    numbers["shared_mem_bytes"] = 4 * text.memory * block.environments
     numbers |= dict.fromkeys(("grid_y", "grid_z", "block_y", "block_z"), 1)
     config = {name: mlir.ir.StringAttr.get(word) for name, word in words.items()}
     return "__gpu$xla.gpu.ptx", config | {n: mlir.i32_attr(x) for n, x in numbers.items()}

@@ -1,5 +1,6 @@
-// The words of a kernel's text. CUDA: a warp steps an environment, its lanes share each statement.
-// C++: one lane does all, and adds in the same order as the 32.
+// The words of a kernel's text. CUDA: WARPS warps step an environment. They share a statement of
+// many numbers (EACH); one of few (FEW), or of sums that lanes share (ONE), is a single warp's, and
+// turn says whose. C++: one lane does all, and adds in the same order as the 32.
 //
 // No word asks lanes for a vote (__any_sync, __reduce_max_sync). On an H200 builds with votes both
 // as a loop's condition and as a branch's gave wrong numbers, the same each time, and nobody found
@@ -13,32 +14,55 @@
 #define INT_MAX 2147483647
 #define INT_MIN (-INT_MAX - 1)
 #define TABLE __device__ const
-#define KERNEL extern "C" __global__ void __launch_bounds__(32 * ENVIRONMENTS, 1) kernel
+#define THREADS (32 * WARPS)  // of an environment
+#define KERNEL extern "C" __global__ void __launch_bounds__(THREADS * ENVIRONMENTS, 1) kernel
 #define FUNCTION static __device__ __forceinline__
 #define ROUTINE static __device__ __noinline__
-#define EACH(i, n) _Pragma("unroll 1") for (int i = lane; i < (n); i += 32)
-#define FEW(i, n) if (const int i = lane; i < (n))
+#define EACH(turn, i, n) \
+  _Pragma("unroll 1") for (int i = first_of(thread, turn); i < (n); i += THREADS)
+#define FEW(turn, i, n) if (const int i = lane; i < (n) && IS(turn))
+#define ONE(turn) if (IS(turn))
+#define IS(turn) (WARPS == 1 || thread / 32 == (turn) % WARPS)
+#define LANES(i, n) _Pragma("unroll 1") for (int i = lane; i < (n); i += 32)
 #define ROUNDS(j, n) _Pragma("unroll 1") for (int j = 0; j < (n); ++j)
-#define SYNC __syncwarp()
+#define SYNC together()
 #define LOCKSTEP __syncthreads()
 #define UNIFORM(x) uniform(x)
 #define SUMS(type, n, start) type sums[n]; _Pragma("unroll") for (int k = 0; k < n; ++k) sums[k] = start;
 #define SUM(k) sums[k]
 #define PUT(join, n, used, memory, to, also) put<n, used>(sums, memory, to, also, lane, join());
 #define BEGIN \
-  const int lane = threadIdx.x & 31; \
-  const int asked = blockIdx.x * ENVIRONMENTS + threadIdx.x / 32; \
-  const bool there = asked < environments[0]; /* the last block's other warps keep step */ \
+  const int thread = threadIdx.x % THREADS, lane = threadIdx.x & 31; \
+  const int asked = blockIdx.x * ENVIRONMENTS + threadIdx.x / THREADS; \
+  const bool there = asked < environments[0]; /* the last block's others keep step */ \
   const size_t e = there ? asked : environments[0] - 1; \
   extern __shared__ float memory_of_block[]; \
-  float* const P = memory_of_block + (threadIdx.x / 32) * MEMORY; \
+  float* const P = memory_of_block + (threadIdx.x / THREADS) * MEMORY; \
   int* const I = (int*)P; \
   const float* const C = (const float*)C_;
 #define END
 
+#ifndef ON_A_CPU
+FUNCTION void wait_at(int barrier, int threads) {
+  asm volatile("bar.sync %0, %1;" ::"r"(barrier), "r"(threads) : "memory");
+}
+#endif
+
+// An environment's warps wait for each other. Barrier 0 is the block's, LOCKSTEP.
+FUNCTION void together() {
+  if (WARPS == 1) __syncwarp();
+  else wait_at(1 + threadIdx.x / THREADS, THREADS);
+}
+
+// Where a thread begins if the warps take turns from one that is not the first.
+FUNCTION int first_of(int thread, int turn) {
+  const int i = thread + 32 * (turn % WARPS);
+  return i < THREADS ? i : i - THREADS;
+}
+
 FUNCTION int uniform(int x) {
   int first = __shfl_sync(~0u, x, 0);
-  __syncwarp();  // all have read before anything is written that the condition was made of
+  together();  // all have read before anything is written that the condition was made of
   return first;
 }
 
@@ -52,9 +76,11 @@ FUNCTION int uniform(int x) {
 #define KERNEL extern "C" void kernel
 #define FUNCTION static inline
 #define ROUTINE static
-#define EACH(i, n) for (int i = 0; i < (n); ++i)
+#define EACH(turn, i, n) ROUNDS(i, n)
 #define FEW EACH
-#define ROUNDS EACH
+#define ONE(turn)
+#define LANES ROUNDS
+#define ROUNDS(j, n) for (int j = 0; j < (n); ++j)
 #define SYNC
 #define LOCKSTEP
 #define UNIFORM(x) (x)
@@ -62,12 +88,12 @@ FUNCTION int uniform(int x) {
 #define SUM(k) sums[k][i & 31]
 #define PUT(join, n, used, memory, to, also) put<used>(sums, memory, to, also, join());
 #define BEGIN \
-  const int lane = 0; \
+  const int lane = 0, thread = 0; \
   const bool there = true; \
   static thread_local float P[MEMORY]; \
   int* const I = (int*)P; \
   const float* const C = (const float*)C_; \
-  (void)lane; (void)C; (void)I; \
+  (void)lane; (void)thread; (void)C; (void)I; \
   for (size_t e = 0; e < (size_t)environments[0]; ++e) { \
     for (float& x : P) x = NAN;  // what is read before it is written shows
 #define END }
@@ -153,8 +179,10 @@ FUNCTION float pivot_of(float x) { return x > 0 ? sqrtf(x) : NAN; }
 
 #ifdef __CUDACC__
 
+// Up to 32 columns by the lanes of a warp, more by all threads of an environment.
 template <int n>
-ROUTINE void cholesky(float* A, int lane) {
+ROUTINE void cholesky(float* A, int thread) {
+  const int lane = threadIdx.x & 31;
   if constexpr (n <= 32) {  // a row in the registers of each lane
     const int r = lane < n ? lane : n - 1;
     float row[n];
@@ -174,14 +202,14 @@ ROUTINE void cholesky(float* A, int lane) {
   } else {
     for (int j = 0; j < n; ++j) {
       const float d = pivot_of(A[j * n + j]);
-      __syncwarp();
-      for (int r = j + lane; r < n; r += 32) A[r * n + j] = r == j ? d : A[r * n + j] / d;
-      __syncwarp();
-      for (int r = j + 1; r < n; ++r)
+      together();
+      for (int r = j + thread; r < n; r += THREADS) A[r * n + j] = r == j ? d : A[r * n + j] / d;
+      together();
+      for (int r = j + 1 + thread / 32; r < n; r += WARPS)
         for (int c = j + 1 + lane; c <= r; c += 32) A[r * n + c] -= A[r * n + j] * A[c * n + j];
-      __syncwarp();
+      together();
     }
-    for (int k = lane; k < n * n; k += 32) if (k % n > k / n) A[k] = 0;
+    for (int k = thread; k < n * n; k += THREADS) if (k % n > k / n) A[k] = 0;
   }
 }
 

@@ -44,6 +44,10 @@ def _split(build: Builder, eqn: core.JaxprEqn, x: Value) -> list[Value]:
     return [build.take(x, part) for part in np.split(x.places, ends, eqn.params["axis"])]
 
 
+def _unstack(build: Builder, eqn: core.JaxprEqn, x: Value) -> list[Value]:
+    return [build.take(x, part) for part in np.moveaxis(x.places, eqn.params["axis"], 0)]
+
+
 def _pad(build: Builder, eqn: core.JaxprEqn, x: Value, filler: Value) -> Value:
     places = x.places
     for axis, (low, high, between) in enumerate(eqn.params["padding_config"]):
@@ -198,4 +202,5 @@ RULES: dict[str, Rule] = {
     "tile": _place(lambda p, places: np.tile(places, p.get("reps", p.get("repeats")))),
     "transpose": _place(lambda p, places: np.transpose(places, p["permutation"])),
     "triangular_solve": _solve,
+    "unstack": _unstack,
 }  # fmt: skip

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from purerl.exact.kernel import memory, operations
-from purerl.exact.kernel.cells import TYPES, Cells, each
+from purerl.exact.kernel.cells import TYPES, Cells
 from purerl.exact.kernel.lanes import LANES
 from purerl.exact.kernel.reading import Program
 from purerl.exact.kernel.schedule import Scheduler
@@ -75,12 +75,12 @@ class _Writer(Cells):
         yield f"KERNEL(const int* environments, {', '.join(words)}) {{\nBEGIN"
         for number, value in enumerate(inputs):
             to = self.memory(value.kind, f"{self.address[value]}+i")
-            yield f"{each(value.size)} {to} = in{number}[e*{value.size}+i];"
+            yield f"{self.each(value.size)} {to} = in{number}[e*{value.size}+i];"
         lines = list(self._plan(self.scheduler.plan, copied=False))
         if self.scheduler.slots:
             slots = np.array(list(self.scheduler.slots), np.uint32).view(np.int32)
             at = self.tables.constant(slots, "i")
-            yield f"{each(len(slots))} I[i] = (int)C_[{at}+i];"
+            yield f"{self.each(len(slots))} I[i] = (int)C_[{at}+i];"
         yield "SYNC;"
         yield from lines
         names: dict[Value, str] = {x: f"out{i}[e*{x.size}+i]" for i, x in enumerate(outputs)}
@@ -93,6 +93,7 @@ class _Writer(Cells):
 
     def _plan(self, plan: Plan, copied: bool = True) -> Iterator[str]:
         for number, level in enumerate(plan.levels):
+            self.turn = 0
             if plan.in_step and number % LOCKSTEP == 0:
                 yield "LOCKSTEP;"
             plain = [x for x in level if isinstance(x, Statement)]
@@ -130,7 +131,7 @@ class _Writer(Cells):
             body = [f"{TYPES[first.kind]} sum = {start};", f"ROUNDS(j, {terms}) {{", *lines]
             body += [f"sum = {join(result)};", "}"]
         target = self.memory(first.kind, f"{self.address[first]}+i")
-        return f"{each(statement.size)} {{ {' '.join(body)} {target} = sum; }}"
+        return f"{self.each(statement.size)} {{ {' '.join(body)} {target} = sum; }}"
 
     def _shared(self, statements: list[Statement]) -> Iterator[str]:
         """The lanes share each row. Rows of equal length are in one loop, and read once."""
@@ -146,8 +147,8 @@ class _Writer(Cells):
                 sums.append(f"SUM({number}) = {text};")
             lines = [f"auto {name} = {text};" for text, name in body.items()]
             count, neutral = _padded(len(some)), operations.neutral(fold, kind)
-            yield f"{{ SUMS({TYPES[kind]}, {count}, {neutral})"
-            yield f"EACH(i, {terms}) {{ {' '.join(lines + sums)} }}"
+            yield f"{self.one()} {{ SUMS({TYPES[kind]}, {count}, {neutral})"
+            yield f"LANES(i, {terms}) {{ {' '.join(lines + sums)} }}"
             to, also = (self.tables.place(x) for x in self._targets(some))
             memory = "P" if kind == "f" else "I"
             yield f"PUT(joined_by_{fold}, {count}, {len(some)}, {memory}, T+{to}, T+{also}) }}"
@@ -218,11 +219,12 @@ class _Writer(Cells):
         (target,), n = step.writes, step.reads[0].shape[0]
         to = self.address[home(target)]
         if step.op == "cholesky":
-            return f"cholesky<{n}>(P + {to}, lane);"
+            whose = self.one() if n <= LANES else ""
+            return f"{whose} cholesky<{n}>(P + {to}, thread);"
         matrix = self.address[matrices[0]]
         steps = f"1, {n}" if step.transposed else f"{n}, 1"
         forward = int(step.lower != step.transposed)
-        return f"solve<{n}, {steps}, {forward}>(P + {matrix}, P + {to}, lane);"
+        return f"{self.one()} solve<{n}, {steps}, {forward}>(P + {matrix}, P + {to}, lane);"
 
 
 def _shape(statement: Statement) -> tuple[str, int, str]:

@@ -19,7 +19,7 @@ def by_one_lane(text, *arrays):
     return launch.on_host(compilers.on_cpu(text), text, *arrays)
 
 
-def by_warps(text, *arrays, folder, environments=2, downwards=False):
+def by_warps(text, *arrays, folder, environments=2, warps=1, downwards=False):
     """Runs a kernel's CUDA text, each lane of a block by itself, on arrays [environments, n]."""
     names = [f"in{i}" for i in range(len(text.inputs))]
     names += [f"out{i}" for i in range(len(text.outputs))]
@@ -29,11 +29,12 @@ def by_warps(text, *arrays, folder, environments=2, downwards=False):
 extern "C" bool on_lanes(const int* count, {words}) {{
   body = [=] {{ kernel(count, {", ".join(names)}); }};
   for (int block = 0; block * ENVIRONMENTS < count[0]; ++block)
-    if (!run_block(block, ENVIRONMENTS, {int(downwards)})) return false;
+    if (!run_block(block, ENVIRONMENTS, WARPS, {int(downwards)})) return false;
   return true;
 }}"""
-    path, library = Path(folder) / "warps.cpp", Path(folder) / f"warps{downwards}.so"
-    path.write_text(f'#include "{WARP}"\n{compilers.source(text, environments)}{call}')
+    path, library = Path(folder) / "warps.cpp", Path(folder) / f"warps{warps}{downwards}.so"
+    source = compilers.source(text, compilers.Block(environments, warps))
+    path.write_text(f'#include "{WARP}"\n{source}{call}')
     words = ["g++", *compilers.CPU_WORDS, str(path), "-o", str(library)]
     subprocess.run(words, check=True)
 

@@ -89,11 +89,11 @@ def test_a_gpus_program_has_one_call_with_a_warp_for_each_environment(kernel, mo
 
 def test_a_block_has_as_many_environments_as_have_room(kernel):
     text = kernel.text
-    assert compilers.environments_of(text, 90) == compilers.MOST_ENVIRONMENTS
-    assert compilers.environments_of(text._replace(memory=5000), 90) == 11
-    assert compilers.environments_of(text._replace(memory=5000), 89) == 5
+    assert compilers.block_of(text, 90) == (16, 1)
+    assert compilers.block_of(text._replace(memory=5000), 90) == (11, 1)
+    assert compilers.block_of(text._replace(memory=5000), 89) == (5, 3)
     with pytest.raises(compilers.CompilerError, match=r"240,000 bytes .* leave this step to XLA"):
-        compilers.environments_of(text._replace(memory=60_000), 90)
+        compilers.block_of(text._replace(memory=60_000), 90)
 
 
 def test_what_is_compiled_is_kept_by_all_that_it_depends_on(monkeypatch, tmp_path):

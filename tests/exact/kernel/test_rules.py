@@ -56,6 +56,13 @@ def solves(a, b):
     )
 
 
+def wide(x):
+    """More columns than a warp has lanes."""
+    y = x.reshape(40, 10)
+    factor = jax.scipy.linalg.cho_factor(y @ y.T + 20 * np.eye(40, dtype=np.float32))
+    return jnp.tril(factor[0]), jax.scipy.linalg.cho_solve(factor, x[:40])
+
+
 def newton(x):
     """Ends after other numbers of rounds for each environment."""
     going = lambda c: (c[1] ** 2 - x[0] ** 2 > 1e-3).any() & (c[0] < 20)  # noqa: E731
@@ -111,7 +118,13 @@ def moved(x):
         lax.pad(x, jnp.float32(7), ((1, 2, 0), (0, -1, 0))),
     ]
     parts += [jnp.tile(x, (2, 1)), jnp.concatenate([x, 0 * x[:1], x[:2]]), jnp.stack([x, x + 1], 1)]
-    parts += [*jnp.split(x, 3), jnp.broadcast_to(x[0], (3, 4)), x.reshape(2, 6), x[::2]]
+    parts += [
+        *jnp.split(x, 3),
+        *lax.unstack(x, axis=1),
+        jnp.broadcast_to(x[0], (3, 4)),
+        x.reshape(2, 6),
+        x[::2],
+    ]
     return parts
 
 
@@ -289,6 +302,7 @@ FUNCTIONS = {
     "reused": (reused, real(9)),
     "solves": (solves, real(4, 4), real(4)),
     "sums": (sums, real(400)),
+    "wide": (wide, real(400)),
     "swapped": (swapped, real(4)),
     "truth": (lambda b: (b, ~b, b.any()), whole(5) > 0),
 }
@@ -331,11 +345,11 @@ def test_a_kernel_computes_what_jax_does(results, name):
 
 
 @needs_compiler
-@pytest.mark.parametrize("downwards", [False, True])
-def test_warps_have_the_bits_of_one_lane(kernel, tmp_path, downwards):
+@pytest.mark.parametrize("warps, downwards", [(1, False), (1, True), (3, False), (3, True)])
+def test_warps_have_the_bits_of_one_lane(kernel, tmp_path, warps, downwards):
     arrays = rows(*map(np.asarray, jax.tree.leaves(INPUTS)))
     one = by_one_lane(kernel.text, *arrays)
-    warps = by_warps(kernel.text, *arrays, folder=tmp_path, downwards=downwards)
+    warps = by_warps(kernel.text, *arrays, folder=tmp_path, warps=warps, downwards=downwards)
     for x, y in zip(one, warps, strict=True):
         np.testing.assert_array_equal(x.view(np.int32), y.view(np.int32))
 

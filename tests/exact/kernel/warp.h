@@ -2,6 +2,7 @@
 // A barrier that is missing shows: one lane then reads what another has not yet written, if lanes
 // run upwards, or what another has already overwritten, if they run downwards.
 #define __CUDACC__
+#define ON_A_CPU
 #define __device__
 #define __global__
 #define __shared__
@@ -25,7 +26,7 @@ static inline float __int_as_float(int bits) { float x; std::memcpy(&x, &bits, 4
 struct Fiber {
   ucontext_t context;
   std::vector<char> stack = std::vector<char>(1 << 16);
-  int waits = 0;  // for a warp (1), for the block (2); -1: it is over
+  int waits = 0;  // for a warp (1), for those at barrier b (2 + b; 0: the block); -1: it is over
   float box;
 };
 static std::vector<Fiber> fibers;
@@ -41,6 +42,7 @@ static void wait_for(int whom) {
 static void begin() { body(); fibers[running].waits = -1; swapcontext(&fibers[running].context, &scheduler); }
 static void __syncwarp() { wait_for(1); }
 static void __syncthreads() { wait_for(2); }
+static void wait_at(int barrier, int) { wait_for(2 + barrier); }
 template <class X> static X read_from(X x, int lane) {
   static_assert(sizeof(X) == 4);
   std::memcpy(&fibers[running].box, &x, 4);
@@ -53,9 +55,9 @@ template <class X> static X read_from(X x, int lane) {
 template <class X> static X __shfl_sync(unsigned, X x, int lane) { return read_from(x, lane); }
 template <class X> static X __shfl_xor_sync(unsigned, X x, int bits) { return read_from(x, running % 32 ^ bits); }
 
-// Runs a block of warps; returns false if lanes wait for each other for ever.
-static bool run_block(int block, int warps, bool downwards) {
-  const int n = 32 * warps;
+// Runs a block; returns false if lanes wait for each other for ever.
+static bool run_block(int block, int environments, int warps, bool downwards) {
+  const int each = 32 * warps, n = each * environments;
   for (float& x : memory_of_block) x = __int_as_float(0x7fc00000);
   fibers = std::vector<Fiber>(n);
   for (Fiber& fiber : fibers) {
@@ -79,7 +81,9 @@ static bool run_block(int block, int warps, bool downwards) {
       return true;
     };
     auto release = [&](int from, int to) { for (int k = from; k < to; ++k) fibers[k].waits = 0; moved = true; };
-    for (int w = 0; w < warps; ++w) if (all(32 * w, 32 * w + 32, 1)) release(32 * w, 32 * w + 32);
+    for (int w = 0; w < n; w += 32) if (all(w, w + 32, 1)) release(w, w + 32);
+    for (int e = 0; e < environments; ++e)
+      if (all(e * each, e * each + each, 3 + e)) release(e * each, e * each + each);
     if (all(0, n, 2)) release(0, n);
     if (!moved && over < n) return false;
   }
