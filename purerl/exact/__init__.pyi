@@ -1,4 +1,5 @@
 # The public names, each once; `__init__.py` reads this list.
+from purerl.exact.kernel.choosing import with_kernel as with_kernel
 from purerl.exact.kernel.compiling import (
     compile_kernel as compile_kernel,
     kernel_agreement as kernel_agreement,

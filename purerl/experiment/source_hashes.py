@@ -9,6 +9,7 @@ import contextlib
 import functools
 import hashlib
 import importlib.util
+import itertools
 import os
 import sys
 import sysconfig
@@ -111,7 +112,7 @@ def package_files(package: Path) -> dict[str, Path]:
     another folder of that name, such as the one that holds the checkout.
     """
     found = {}
-    for file in package.rglob("*.py"):
+    for file in itertools.chain(package.rglob("*.py"), package.rglob("*.h")):
         room, *inside = file.relative_to(package).with_suffix("").parts
         if inside and not {room, ".".join((room, *inside))} & (LEFT_OUT | IMPORTED):
             found[".".join((package.name, room, *inside)).removesuffix(".__init__")] = file

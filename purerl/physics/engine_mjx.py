@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from purerl import exact
 from purerl.core.records import Array, PyTree
@@ -22,6 +23,10 @@ _IN_IMPL += ("subtree_angmom", "cacc", "cfrc_int", "cfrc_ext")
 # What MuJoCo computes with the sensors of accelerations: under RK4 at the first of four stages,
 # where MJX has the last; forces and accelerations are the last stage's.
 _OF_SENSORS = ("sensordata", "cacc", "cfrc_int", "cfrc_ext")
+# On a GPU a control step is one kernel if the Jacobian of its constraints has no more numbers:
+# larger ones take minutes to write down, and then too few environments fit (docs/measurements.md).
+MOST_OF_A_KERNEL = 6000
+TRIED, TRIED_FOR = 64, 12  # simulations and control steps on which a kernel is compared with XLA
 
 
 class JaxEngine:
@@ -61,6 +66,13 @@ class JaxEngine:
         platform = platform or device.platform
         self._exact_init = exact.rewrite(self.plain_init, platform=platform)
         self._exact_step = exact.rewrite(self.plain_step, platform=platform)
+        self.stepped_by: list[str] = []  # what computes a step, for each set of shapes
+        if platform != "cpu" and self.data._impl.efc_J.size <= MOST_OF_A_KERNEL:
+            self._by_xla = jax.jit(jax.vmap(self._exact_step))
+            say = self.stepped_by.append
+            self._exact_step = exact.with_kernel(
+                self.plain_step, self._exact_step, self._reached, say
+            )
 
     def init(self, state: PyTree, changes: dict[str, Array], ctrl: Array | None = None) -> tuple:
         """Returns the readings at `state` under ctrl [nu], by default zeros."""
@@ -99,6 +111,25 @@ class JaxEngine:
         places = [f"_impl.{name}" if name in _IN_IMPL else name for name in self.late]
         data = self.data.replace(**vars(state)).tree_replace(dict(zip(places, late, strict=True)))
         return state, self._read(_kinematics(model, data))
+
+    def _reached(self, *example: PyTree) -> tuple[tuple, tuple]:
+        """Returns arguments of `step` for some simulations that XLA has stepped, and its results.
+
+        They begin as the model says, near rest, and move under random controls.
+        """
+        state, ctrl, changes = example
+        rng = np.random.default_rng(0)
+        alike = lambda x, like: np.tile(np.reshape(x, like.shape), (TRIED, *[1] * like.ndim))  # noqa: E731
+        begun = {n: alike(getattr(self.data, n), x) for n, x in vars(state).items()}
+        begun["qvel"] = begun["qvel"] + np.float32(0.1) * rng.normal(size=begun["qvel"].shape)
+        changes = {n: alike(getattr(self.model, n), x) for n, x in changes.items()}
+        states = state.replace(**{n: x.astype(np.float32) for n, x in begun.items()})
+        with mjx_defaults():
+            for _ in range(TRIED_FOR):
+                ctrls = rng.uniform(-1, 1, (TRIED, *ctrl.shape)).astype(np.float32)
+                args = states, ctrls, changes
+                states, readings = self._by_xla(*args)
+        return args, (states, readings)
 
     def _changed(self, changes: dict[str, Array]) -> mjx.Model:
         """Returns the model with changes; MJX's matrices (`cam_mat0`) are [n, 3, 3]."""

@@ -171,6 +171,14 @@ class Physics:
         fields.check_shape("ctrl", ctrl, (self.model.nu,))
         return self._engine.step(state, _float32(ctrl), self.check_changes(changes))
 
+    @property
+    def stepped_by(self) -> tuple[str, ...]:
+        """What computes steps, of those traced so far, where that is chosen: on a GPU, of `jax`.
+
+        "one kernel", or "XLA: " and why.
+        """
+        return tuple(getattr(self._engine, "stepped_by", ()))
+
     def derive(self, changes: dict[str, Array]) -> dict[str, Array]:
         """Returns changes with the constants that MuJoCo derives from them, such as `dof_M0`.
 

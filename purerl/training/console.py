@@ -61,6 +61,7 @@ def describe_plan(
         "state": f"{memory.size(abstract) / 1e6:,.1f} MB",
         "engine": f"{setup.engine}{engine_remark(setup.engine, kind)}",
         "shards": number > 1 and f"{number}, {each}",
+        "stepped by": "; ".join(facts.get("stepped_by", ())),
         "device": f"{devices} x {kind['kind']} ({kind['platform']})",
         "cache": cache,
         "bit-exact": f"no: {inexact}" if inexact else "yes",

@@ -122,6 +122,8 @@ def _facts(
     inexact = getattr(setup.env, "inexact", "")
     facts = manifest.describe_process(setup.engine, builders, kernels, shards.number, inexact)
     facts["model"] = objects.physics_hash(setup.env)
+    if stepped_by := getattr(getattr(setup.env, "physics", None), "stepped_by", ()):
+        facts["stepped_by"] = list(stepped_by)
     with objects.naming_broken_rules(setup.env):
         facts["arrays"] = hash_held(setup.env, setup.network)
     facts["experiment_file"] = str(source.path)

@@ -1,11 +1,12 @@
 """C for single numbers: of memory, of constants, and what is computed of them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from purerl.exact.kernel import indices, operations
 from purerl.exact.kernel.lanes import LANES
+from purerl.exact.kernel.side_by_side import Job
 from purerl.exact.kernel.statements import Code, Leaf, Line
 from purerl.exact.kernel.values import Const, Value, home
 
@@ -25,13 +26,16 @@ class Cells:
 
     def each(self, size: int) -> str:
         """Returns C that does something for each i; the warps of an environment take turns."""
-        turn, self.turn = self.turn, self.turn + -(-size // LANES)
-        return f"{'EACH' if size > LANES else 'FEW'}({turn}, i, {size})"
+        return f"{'EACH' if size > LANES else 'FEW'}({self.turns(size)}, i, {size})"
 
     def one(self) -> str:
         """Returns C that lets the warp whose turn it is do something alone."""
-        self.turn += 1
-        return f"ONE({self.turn - 1})"
+        return f"ONE({self.turns(1)})"
+
+    def turns(self, size: int) -> int:
+        """Returns whose turn it is; so many numbers are a turn for each warp's worth of them."""
+        self.turn += -(-size // LANES)
+        return self.turn - -(-size // LANES)
 
     def memory(self, kind: str, place: str) -> str:
         """Returns C for a number in memory."""
@@ -55,10 +59,10 @@ class Cells:
             return self.constant(leaf.at, leaf.kind, number)
         return self.memory(leaf.kind, indices.text(self.tables, self.addresses(leaf), number))
 
-    def term(self, leaf: Leaf, term: int | None) -> str:
-        """Returns C for a leaf [rows, terms] at row i, and at a term or, of None, at term j."""
+    def term(self, leaf: Leaf, term: int | None, number: str = "i") -> str:
+        """Returns C for a leaf [rows, terms] at a row, and at a term or, of None, at term j."""
         if term is not None:
-            return self.leaf(leaf._replace(which=leaf.which[:, term], at=leaf.at[:, term]))
+            return self.leaf(leaf._replace(which=leaf.which[:, term], at=leaf.at[:, term]), number)
         rows, terms = leaf.at.shape
         if not leaf.sources:
             return self.constant(np.ascontiguousarray(leaf.at.T), leaf.kind, f"{rows}*j+i")
@@ -71,15 +75,18 @@ class Cells:
             place = indices.text(self.tables, np.ascontiguousarray(at.T).reshape(-1), f"{rows}*j+i")
         return self.memory(leaf.kind, place)
 
-    def code(self, code: Code, leaves: Sequence[str]) -> tuple[list[str], str]:
-        """Returns the lines that compute one number, given C for its leaves, and its name."""
-        lines = [f"{TYPES[x.kind]} l{i} = {text};"
+    def code(self, code: Code, leaves: Sequence[str], name: str = "") -> tuple[list[str], str]:
+        """Returns the lines that compute one number, given C for its leaves, and its name.
+
+        All names begin with `name`.
+        """
+        named = lambda number: name + (f"t{number}" if number >= 0 else f"l{~number}")  # noqa: E731
+        lines = [f"{TYPES[x.kind]} {named(~i)} = {text};"
                  for i, (x, text) in enumerate(zip(code.leaves, leaves, strict=True))]  # fmt: skip
         for number, line in enumerate(code.lines):
-            args = [_name(arg) for arg in line.args]
-            text = self.operation(code, line, args)
-            lines.append(f"{TYPES[line.kind]} t{number} = {text};")
-        return lines, _name(code.result)
+            text = self.operation(code, line, [named(arg) for arg in line.args])
+            lines.append(f"{TYPES[line.kind]} {named(number)} = {text};")
+        return lines, named(code.result)
 
     def operation(self, code: Code, line: Line, args: list[str]) -> str:
         """Returns C for a line, given C for its arguments."""
@@ -95,18 +102,21 @@ class Cells:
         lines, result = self.code(code, [self.leaf(leaf) for leaf in code.leaves])
         return f"{self.each(size)} {{ {' '.join(lines)} {target} = {result}; }}"
 
-    def copy(self, value: Value, code: Code, size: int = 0) -> str:
-        """Returns C that computes numbers, by default a value's, and puts them where it stands."""
-        target = self.memory(value.kind, f"{self.address[value]}+i")
-        return self.assign(target, size or value.size, code)
+    def job(self, value: Value, code: Code, size: int = 0) -> Job:
+        """Returns what computes numbers, by default a value's, and puts them where it stands."""
+
+        def lines(place: str, name: str) -> tuple[list[str], str]:
+            return self.code(code, [self.leaf(leaf, place) for leaf in code.leaves], name)
+
+        return Job(size or value.size, max(1, len(code.leaves)), lines, self.target(value))
+
+    def target(self, value: Value) -> Callable[[str], str]:
+        """Returns C for a value's number at a place."""
+        return lambda place: self.memory(value.kind, f"{self.address[value]}+{place}")
 
 
 def _of_table(kind: str, place: str) -> str:
     return f"C[{place}]" if kind == "f" else f"((int)C_[{place}])"
-
-
-def _name(number: int) -> str:
-    return f"t{number}" if number >= 0 else f"l{~number}"
 
 
 def _literal(number: float, kind: str) -> str:

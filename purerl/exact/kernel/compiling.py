@@ -112,11 +112,12 @@ def kernel_agreement(kernel: Kernel, f: Callable, *args: Any) -> Agreement:
       f: as XLA shall compile it.
       *args: real arguments of several environments, with a leading axis.
     """
-    found, wanted = (
-        np.concatenate([np.reshape(x, (len(x), -1)) for x in jax.tree.leaves(run(*args))], 1)
-        for run in (jax.jit(jax.vmap(kernel)), jax.jit(jax.vmap(f)))
-    )
-    return agreement(found, wanted)
+    return agreement(*(as_rows(jax.jit(jax.vmap(run))(*args)) for run in (kernel, f)))
+
+
+def as_rows(results: Any) -> np.ndarray:
+    """Returns results of several environments as [environments, numbers]."""
+    return np.concatenate([np.reshape(x, (len(x), -1)) for x in jax.tree.leaves(results)], 1)
 
 
 def agreement(found: np.ndarray, wanted: np.ndarray) -> Agreement:

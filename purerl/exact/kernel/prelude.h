@@ -1,6 +1,6 @@
 // The words of a kernel's text. CUDA: WARPS warps step an environment. They share a statement of
-// many numbers (EACH); one of few (FEW), or of sums that lanes share (ONE), is a single warp's, and
-// turn says whose. C++: one lane does all, and adds in the same order as the 32.
+// many numbers (EACH, SEVERAL); statements of few, or of sums that lanes share, are a single warp's
+// (ONE), and turn says whose. C++: one lane does all, and adds in the same order as the 32.
 //
 // No word asks lanes for a vote (__any_sync, __reduce_max_sync). On an H200 builds with votes both
 // as a loop's condition and as a branch's gave wrong numbers, the same each time, and nobody found
@@ -20,11 +20,16 @@
 #define ROUTINE static __device__ __noinline__
 #define EACH(turn, i, n) \
   _Pragma("unroll 1") for (int i = first_of(thread, turn); i < (n); i += THREADS)
+#define SEVERAL(turn, i, times, n) \
+  _Pragma("unroll 1") for (int i = first_of(thread, turn); i < (n); i += times * THREADS)
+#define AT(i, k, n) least(i + k * THREADS, n - 1)
 #define FEW(turn, i, n) if (const int i = lane; i < (n) && IS(turn))
+#define WARP(lanes)
 #define ONE(turn) if (IS(turn))
 #define IS(turn) (WARPS == 1 || thread / 32 == (turn) % WARPS)
 #define LANES(i, n) _Pragma("unroll 1") for (int i = lane; i < (n); i += 32)
 #define ROUNDS(j, n) _Pragma("unroll 1") for (int j = 0; j < (n); ++j)
+#define REPEAT(j, n) for (int j = 0, end = unknown(n); j < end; ++j)  // too long to be unrolled
 #define SYNC together()
 #define LOCKSTEP __syncthreads()
 #define UNIFORM(x) uniform(x)
@@ -54,6 +59,12 @@ FUNCTION void together() {
   else wait_at(1 + threadIdx.x / THREADS, THREADS);
 }
 
+// Hides a number from the compiler, which would unroll long loops whatever a pragma says.
+FUNCTION int unknown(int x) {
+  asm volatile("" : "+r"(x));
+  return x;
+}
+
 // Where a thread begins if the warps take turns from one that is not the first.
 FUNCTION int first_of(int thread, int turn) {
   const int i = thread + 32 * (turn % WARPS);
@@ -77,10 +88,14 @@ FUNCTION int uniform(int x) {
 #define FUNCTION static inline
 #define ROUTINE static
 #define EACH(turn, i, n) ROUNDS(i, n)
+#define SEVERAL(turn, i, times, n) for (int i = 0; i < (n); i += times)
+#define AT(i, k, n) least(i + k, n - 1)
 #define FEW EACH
+#define WARP(lanes) ROUNDS(lane, lanes)
 #define ONE(turn)
 #define LANES ROUNDS
 #define ROUNDS(j, n) for (int j = 0; j < (n); ++j)
+#define REPEAT ROUNDS
 #define SYNC
 #define LOCKSTEP
 #define UNIFORM(x) (x)
@@ -191,7 +206,7 @@ ROUTINE void cholesky(float* A, int thread) {
 #pragma unroll
     for (int j = 0; j < n; ++j) {
       const float d = pivot_of(__shfl_sync(~0u, row[j], j));
-      row[j] = r == j ? d : row[j] / d;
+      row[j] = r == j ? d : row[j] * (1.0f / d);
 #pragma unroll
       for (int c = j + 1; c < n; ++c) row[c] -= row[j] * __shfl_sync(~0u, row[j], c);
     }
@@ -203,7 +218,7 @@ ROUTINE void cholesky(float* A, int thread) {
     for (int j = 0; j < n; ++j) {
       const float d = pivot_of(A[j * n + j]);
       together();
-      for (int r = j + thread; r < n; r += THREADS) A[r * n + j] = r == j ? d : A[r * n + j] / d;
+      for (int r = j + thread; r < n; r += THREADS) A[r * n + j] = r == j ? d : A[r * n + j] * (1.0f / d);
       together();
       for (int r = j + 1 + thread / 32; r < n; r += WARPS)
         for (int c = j + 1 + lane; c <= r; c += 32) A[r * n + c] -= A[r * n + j] * A[c * n + j];
@@ -218,9 +233,13 @@ ROUTINE void cholesky(float* A, int thread) {
 template <int n, int down, int across, int forward>
 ROUTINE void solve(const float* A, float* x, int lane) {
   constexpr int rows = (n + 31) / 32;
-  float y[rows];
+  float y[rows], per_pivot[rows];
 #pragma unroll
-  for (int t = 0; t < rows; ++t) y[t] = lane + 32 * t < n ? x[lane + 32 * t] : 0.0f;
+  for (int t = 0; t < rows; ++t) {
+    const int r = lane + 32 * t;
+    y[t] = r < n ? x[r] : 0.0f;
+    per_pivot[t] = r < n ? 1.0f / A[r * (down + across)] : 0.0f;
+  }
 #pragma unroll 1
   for (int q = 0; q < n; ++q) {
     const int k = forward ? q : n - 1 - q;
@@ -228,7 +247,7 @@ ROUTINE void solve(const float* A, float* x, int lane) {
 #pragma unroll
     for (int t = 0; t < rows; ++t)
       if (k / 32 == t) {
-        if (lane == k % 32) y[t] /= A[k * (down + across)];
+        if (lane == k % 32) y[t] *= per_pivot[t];
         mine = y[t];
       }
     const float found = __shfl_sync(~0u, mine, k % 32);
@@ -248,7 +267,7 @@ template <int n>
 ROUTINE void cholesky(float* A, int) {
   for (int j = 0; j < n; ++j) {
     const float d = A[j * n + j] = pivot_of(A[j * n + j]);
-    for (int r = j + 1; r < n; ++r) A[r * n + j] /= d;
+    for (int r = j + 1; r < n; ++r) A[r * n + j] *= 1.0f / d;
     for (int r = j + 1; r < n; ++r)
       for (int c = j + 1; c <= r; ++c) A[r * n + c] -= A[r * n + j] * A[c * n + j];
     for (int c = j + 1; c < n; ++c) A[j * n + c] = 0;
@@ -259,7 +278,7 @@ template <int n, int down, int across, int forward>
 ROUTINE void solve(const float* A, float* x, int) {
   for (int q = 0; q < n; ++q) {
     const int k = forward ? q : n - 1 - q;
-    x[k] /= A[k * (down + across)];
+    x[k] *= 1.0f / A[k * (down + across)];
     for (int r = forward ? k + 1 : 0; r < (forward ? n : k); ++r)
       x[r] -= A[r * down + k * across] * x[k];
   }

@@ -16,7 +16,7 @@ from purerl.exact.kernel.values import Held, Value, home
 
 # Numbers of a statement that is made one with others of its kind. More of them, and where each
 # reads is no longer said in a few instructions.
-MERGED = 64
+MERGED = 32
 # What stands for the memory of single constants, which a view mixes with numbers of values.
 SLOTS = Held((0,), "f", values.Block("top"))
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from purerl.exact.kernel import memory, operations
+from purerl.exact.kernel import memory, operations, side_by_side
 from purerl.exact.kernel.cells import TYPES, Cells
 from purerl.exact.kernel.lanes import LANES
 from purerl.exact.kernel.reading import Program
@@ -15,9 +15,9 @@ from purerl.exact.kernel.statements import Code, Plan, Statement, StepStatement
 from purerl.exact.kernel.values import Choice, Linear, Loop, NoRuleError, Value, home
 
 # What follows is of the fastest build on an H200 (lab/2026-11-29-one-kernel-on-a-cpu.md).
-LOCKSTEP = 4  # levels from one barrier of a block to the next: its warps share fetched code
+LOCKSTEP = 8  # levels from one barrier of a block to the next: its warps share fetched code
 FEW_TERMS = 20  # a row of no more is written out, one of more is a loop
-AT_ONCE = 128  # results that lanes sum in one loop: each takes a register
+AT_ONCE = 64  # results that lanes sum in one loop: each takes a register
 MOST_MEMORY = 1 << 16  # numbers: their places are kept in 16 bits
 
 
@@ -100,38 +100,58 @@ class _Writer(Cells):
             shared = sorted((x for x in plain if x.shared), key=_shape)
             for _, some in itertools.groupby(shared, _shape):
                 yield from self._shared(list(some))
-            for statement in plain:
-                if not statement.shared:
-                    yield (
-                        self._fold(statement)
-                        if statement.fold
-                        else self.copy(statement.writes[0], statement.code, statement.size)
-                    )
+            others = [x for x in plain if not x.shared]
+            yield from map(self._fold, (x for x in others if x.terms > FEW_TERMS))
+            yield from self._jobs([self._job(x) for x in others if x.terms <= FEW_TERMS])
             for step in level:
                 if isinstance(step, StepStatement):
                     yield from self._step(step)
             yield "SYNC;"
             self.statements += len(level)
         if copied and plan.copies:
-            yield from (self.copy(value, code) for value, code in plan.copies)
+            yield from self._jobs([self.job(value, code) for value, code in plan.copies])
             yield "SYNC;"
 
-    def _fold(self, statement: Statement) -> str:
-        """Each lane makes a row one number, from its first term to its last."""
+    def _jobs(self, jobs: Sequence[side_by_side.Job]) -> Iterator[str]:
+        """Writes what is independent: see `side_by_side`."""
+        parts = [side_by_side.parts_of(job) for job in jobs]
+        for group in side_by_side.groups([x for some in parts for x in some]):
+            yield f"{self.one()} {side_by_side.group_text(group)}"
+        for job, some in zip(jobs, parts, strict=True):
+            if not some:
+                yield side_by_side.loop_text(job, self.turns(job.size))
+
+    def _job(self, statement: Statement) -> side_by_side.Job:
+        """Each lane makes a row of few terms one number, from its first term to its last."""
         first, code, terms = statement.writes[0], statement.code, statement.terms
-        join = lambda x: operations.text_of(statement.fold, first.kind, None, "sum", x)  # noqa: E731
-        if terms <= FEW_TERMS:
-            body = [f"{TYPES[first.kind]} sum;"]
+        job = self.job(first, code, statement.size)
+        if not statement.fold:
+            return job
+
+        def lines(place: str, name: str) -> tuple[list[str], str]:
+            body: list[str] = []
+            found = ""
             for term in range(terms):
-                lines, result = self.code(code, [self.term(leaf, term) for leaf in code.leaves])
-                body.append(f"{{ {' '.join(lines)} sum = {join(result) if term else result}; }}")
-        else:
-            lines, result = self.code(code, [self.term(leaf, None) for leaf in code.leaves])
-            start = operations.neutral(statement.fold, first.kind)
-            body = [f"{TYPES[first.kind]} sum = {start};", f"ROUNDS(j, {terms}) {{", *lines]
-            body += [f"sum = {join(result)};", "}"]
-        target = self.memory(first.kind, f"{self.address[first]}+i")
-        return f"{self.each(statement.size)} {{ {' '.join(body)} {target} = sum; }}"
+                leaves = [self.term(leaf, term, place) for leaf in code.leaves]
+                some, result = self.code(code, leaves, f"{name}_{term}")
+                if term:
+                    result = operations.text_of(statement.fold, first.kind, None, found, result)
+                    some.append(f"{TYPES[first.kind]} {name}s{term} = {result};")
+                    result = f"{name}s{term}"
+                body, found = body + some, result
+            return body, found
+
+        return job._replace(reads=terms * job.reads, lines=lines)
+
+    def _fold(self, statement: Statement) -> str:
+        """Each lane makes a row of many terms one number, from its first term to its last."""
+        first, code = statement.writes[0], statement.code
+        lines, result = self.code(code, [self.term(leaf, None) for leaf in code.leaves])
+        result = operations.text_of(statement.fold, first.kind, None, "sum", result)
+        start = operations.neutral(statement.fold, first.kind)
+        body = [f"{TYPES[first.kind]} sum = {start};", f"ROUNDS(j, {statement.terms}) {{", *lines]
+        body += [f"sum = {result};", "}", f"{self.target(first)('i')} = sum;"]
+        return f"{self.each(statement.size)} {{ {' '.join(body)} }}"
 
     def _shared(self, statements: list[Statement]) -> Iterator[str]:
         """The lanes share each row. Rows of equal length are in one loop, and read once."""
@@ -177,7 +197,7 @@ class _Writer(Cells):
     # --- steps ---
 
     def _step(self, statement: StepStatement) -> Iterator[str]:
-        yield from (self.copy(value, code) for value, code in statement.copies)
+        yield from self._jobs([self.job(value, code) for value, code in statement.copies])
         yield "SYNC;"
         step = statement.step
         if isinstance(step, Linear):
@@ -190,7 +210,7 @@ class _Writer(Cells):
 
     def _loop(self, step: Loop, plans: Sequence[Plan]) -> Iterator[str]:
         if step.rounds is not None:
-            yield f"ROUNDS(round{step.inner.depth}, {step.rounds}) {{"
+            yield f"REPEAT(round{step.inner.depth}, {step.rounds}) {{"
         else:
             yield "for (;;) {"
             yield from self._plan(plans[0])

@@ -1,0 +1,72 @@
+"""`with_kernel`: a function that one kernel computes where that is possible, faster and right."""
+
+import concurrent.futures
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from purerl.exact.kernel import compilers, compiling, launch
+
+# Environments of a block. With fewer, too few warps hide how long each has to wait: a humanoid, of
+# which 5 fit, is no faster than by XLA (docs/measurements.md).
+FEWEST = 8
+
+
+def with_kernel(
+    f: Callable, by_xla: Callable, reached: Callable, say: Callable[[str], None]
+) -> Callable:
+    """Returns `by_xla`, computed by one kernel of `f` where one can be had.
+
+    A kernel is compared with XLA's results before its first use, for each set of shapes. The
+    derivative is that of `by_xla`.
+
+    Args:
+      f: a pure function of pytrees, of one environment.
+      by_xla: the same, as XLA shall compute it without a kernel.
+      reached: (*example) -> arguments of several environments with a leading axis, of the shapes of
+        the example, and what XLA makes of them.
+      say: is told once for each set of shapes what computes it: "one kernel", or why it is XLA.
+    """
+
+    @functools.cache
+    def kernel_of(tree: Any, shapes: tuple) -> compiling.Kernel | None:
+        example = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*x) for x in shapes])
+        kernel, why = _tried(f, reached, example)
+        say(why or "one kernel")
+        return kernel
+
+    @functools.wraps(by_xla)
+    def function(*args: Any) -> Any:
+        leaves, tree = jax.tree.flatten(args)
+        kernel = kernel_of(tree, tuple((np.shape(x), np.result_type(x)) for x in leaves))
+        if kernel is None:
+            return by_xla(*args)
+        computed = jax.custom_jvp(kernel)
+        computed.defjvp(functools.partial(jax.jvp, by_xla))
+        return computed(*args)
+
+    return jax.jit(function, inline=True)
+
+
+def _tried(f: Callable, reached: Callable, example: tuple) -> tuple[compiling.Kernel | None, str]:
+    """Returns a kernel that may be used, or None and why."""
+    try:
+        kernel = compiling.compile_kernel(f, *example)
+        fit = compilers.block_of(kernel.text, launch.capability()).environments
+        if fit < FEWEST:
+            return None, f"XLA: a block of this GPU has room for {fit} environments, of {FEWEST}"
+        # What is traced around this call is no business of the comparison: a thread has no trace.
+        with concurrent.futures.ThreadPoolExecutor(1) as thread:
+            found = thread.submit(_compared, kernel, reached, example).result()
+    except (compiling.NoRuleError, compilers.CompilerError) as error:
+        return None, f"XLA: {error}"
+    return (kernel, "") if found.agrees else (None, f"XLA: the kernel's results differ, {found}")
+
+
+def _compared(kernel: compiling.Kernel, reached: Callable, example: tuple) -> compiling.Agreement:
+    args, wanted = reached(*example)
+    found = jax.jit(jax.vmap(kernel))(*args)
+    return compiling.agreement(*map(compiling.as_rows, (found, wanted)))

@@ -1,0 +1,105 @@
+"""Which of a function's two programs is run: one kernel, or XLA's. 20 s."""
+
+import re
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from purerl import exact
+from purerl.physics import engine_mjx
+from purerl.physics.interface import Physics
+from tests.exact.kernel import needs_compiler
+from tests.exact.kernel.test_models import PENDULUM
+
+ROWS = np.random.default_rng(0).normal(size=(5, 40)).astype(np.float32)
+
+
+def doubled(x):
+    return {"sine": jnp.sin(x), "sum": (x * x).sum()}
+
+
+def by_xla(x):
+    """The same, marked: what is off by 1e-6 tells who computed it."""
+    return {"sine": jnp.sin(x) + 1e-6, "sum": (x * x).sum() * 3 / 3}
+
+
+def reached(example):
+    rows = ROWS[:, : example.shape[0]]
+    return (rows,), jax.vmap(by_xla)(rows)
+
+
+@needs_compiler
+def test_a_kernel_is_taken_that_has_been_compared_and_has_xlas_derivative():
+    said, compared = [], []
+
+    def watched(example):
+        compared.append(example)
+        return reached(example)
+
+    function = exact.with_kernel(doubled, by_xla, watched, said.append)
+    found = jax.jit(jax.vmap(function))(ROWS)
+    assert said == ["one kernel"] and [x.shape for x in compared] == [(40,)]
+    marked = jax.jit(jax.vmap(by_xla))(ROWS)
+    assert (np.abs(found["sine"] - marked["sine"]) > 5e-7).all(), "XLA computed it"
+    assert np.allclose(found["sine"], marked["sine"], atol=2e-6)
+    slope = jax.grad(lambda x: function(x)["sum"])(ROWS[0])
+    np.testing.assert_allclose(slope, 2 * ROWS[0], 1e-5)
+    assert len(compared) == 1, "it is compared once"
+    function(ROWS[0][:7])
+    assert said == ["one kernel"] * 2
+
+
+def unknown(x):
+    return {"sine": jnp.fft.fft(x).real, "sum": x.sum()}
+
+
+def large(x):
+    y = jax.lax.fori_loop(0, 2, lambda _, c: jnp.sin(c[::-1]), jnp.tile(x, 200))
+    return {"sine": y[:40], "sum": y.sum()}
+
+
+def wrong(x):
+    return {"sine": jnp.sin(x) * 1.1, "sum": (x * x).sum()}
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    "function, why",
+    [
+        (unknown, "XLA: No kernel computes .* of numbers of complex64"),
+        (large, "XLA: a block of this GPU has room for"),
+        (wrong, r"XLA: the kernel's results differ, Agreement\(error=0\.\d"),
+    ],
+)
+def test_xla_computes_what_no_kernel_can_and_says_why(function, why):
+    said = []
+    chosen = exact.with_kernel(function, by_xla, reached, said.append)
+    found = jax.jit(jax.vmap(chosen))(ROWS)
+    np.testing.assert_array_equal(found["sine"], jax.jit(jax.vmap(by_xla))(ROWS)["sine"])
+    (line,) = said
+    assert re.match(why, line), line
+
+
+@needs_compiler
+def test_a_gpus_engine_steps_by_a_kernel_what_is_small(monkeypatch):
+    physics = Physics(mujoco.MjModel.from_xml_string(PENDULUM), ("xpos",), 3, "jax")
+    make = partial(engine_mjx.JaxEngine, physics.model, physics._engine.record, (), 3)
+    engine = make(platform="interpreted")
+    state, _ = physics.init(physics.model.qpos0, np.ones(1))
+    mass = jnp.asarray(physics.model.body_mass, jnp.float32) * np.linspace(1, 2, 3)[:, None]
+    states, ctrl = jax.tree.map(lambda x: jnp.stack([x] * 3), state), jnp.ones((3, 1))
+
+    def stepped(engine):
+        return jax.vmap(lambda *x: engine.step(*x[:2], {"body_mass": x[2]}))(states, ctrl, mass)
+
+    results = [stepped(e) for e in (engine, physics._engine)]
+    assert engine.stepped_by == ["one kernel"] and physics.stepped_by == ()
+    for x, y in zip(*map(jax.tree.leaves, results), strict=True):
+        np.testing.assert_allclose(x, y, 1e-5, 1e-6)
+    assert len(set(np.ravel(results[0][0].qvel).tolist())) == 3, "each has a mass of its own"
+    monkeypatch.setattr(engine_mjx, "MOST_OF_A_KERNEL", -1)
+    assert not hasattr(make(platform="interpreted"), "_by_xla")
