@@ -9,7 +9,6 @@ import contextlib
 import functools
 import hashlib
 import importlib.util
-import itertools
 import os
 import sys
 import sysconfig
@@ -54,6 +53,7 @@ def source_hashes(builders: Iterable[Callable], package: Path = PACKAGE) -> dict
     files = package_files(package) | imported_files(map(module_of, builders))
     folders = {file.parent.parent / "assets" for file in files.values()}
     bodies = {f"assets/{f.name}": f for folder in folders for f in folder.rglob("*.xml")}
+    bodies |= {str(f.relative_to(package)): f for f in package.rglob("*.h")}  # of kernels
     found = {name: known_hash(text_of(name, file)) for name, file in files.items()}
     found |= {name: hashlib.sha256(f.read_bytes()).hexdigest() for name, f in bodies.items()}
     # By name, not by place: a moved checkout is the same source.
@@ -112,7 +112,7 @@ def package_files(package: Path) -> dict[str, Path]:
     another folder of that name, such as the one that holds the checkout.
     """
     found = {}
-    for file in itertools.chain(package.rglob("*.py"), package.rglob("*.h")):
+    for file in package.rglob("*.py"):
         room, *inside = file.relative_to(package).with_suffix("").parts
         if inside and not {room, ".".join((room, *inside))} & (LEFT_OUT | IMPORTED):
             found[".".join((package.name, room, *inside)).removesuffix(".__init__")] = file

@@ -81,6 +81,13 @@ def test_an_operator_of_any_module_that_computes_is_named(copy):
     assert {"purerl.ppo.losses", "purerl.core.parts", "purerl.physics.engine_c"} <= set(edited)
 
 
+def test_the_words_of_kernels_in_c_count(copy):
+    file = copy / "exact" / "kernel" / "prelude.h"
+    assert changed_by(copy, lambda: file.write_text(file.read_text() + "\n// More.\n")) == [
+        "exact/kernel/prelude.h"
+    ]
+
+
 def test_a_comment_and_a_docstring_change_no_hash(copy):
     files = source_hashes.package_files(copy)
 

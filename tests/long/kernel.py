@@ -38,7 +38,7 @@ from purerl.exact.kernel import compilers, compiling, launch
 from purerl.exact.kernel.text import Text
 from purerl.experiment import command_line
 from purerl.experiment.loading import find_source
-from purerl.physics.engine_mjx import mjx_defaults
+from purerl.physics import engine_mjx
 
 NUMBERS = (1024, 4096, 8192)  # environments whose rate is measured
 BESIDE = 4096  # at which engine `jax`, which takes long to compile, is measured, too
@@ -100,13 +100,14 @@ class Subject(NamedTuple):
 
 def subject(experiment: str, words: list[str]) -> Subject:
     """Returns an experiment's physics on engine `jax`."""
+    engine_mjx.MOST_OF_A_KERNEL = -1  # what is compared with is XLA's
     chosen, _ = command_line.from_command_line(
         find_source(experiment), [*words, "--engine", "jax"], experiment
     )
     env = chosen.build_env(chosen.env, "jax")
 
     def step(state: Any, ctrl: Any, changes: dict) -> Any:
-        with mjx_defaults():
+        with engine_mjx.mjx_defaults():
             return env.physics._engine.plain_step(state, ctrl, changes)
 
     def begun(number: jax.Array) -> Any:

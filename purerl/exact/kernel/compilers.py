@@ -86,7 +86,7 @@ def on_cpu(text: Text) -> Callable[..., None]:
                 raise CompilerError(f"g++ refuses a kernel: {done.stderr[:500]}")
             return library.read_bytes()
 
-    path = _kept(source(text), (version.stdout, *CPU_WORDS), "so", make)
+    path = kept(source(text), (version.stdout, *CPU_WORDS), "so", make)
     return ctypes.CDLL(str(path)).kernel
 
 
@@ -101,7 +101,7 @@ def for_gpu(text: Text, chip: int) -> str:
     words = (*GPU_WORDS, f"--gpu-architecture=compute_{chip}")
     numbers = tuple(str(x.value) for x in version)
     whole = source(text, block_of(text, chip))
-    return _kept(whole, (*numbers, *words), "ptx", lambda x: _ptx(library, x, words)).read_text()
+    return kept(whole, (*numbers, *words), "ptx", lambda x: _ptx(library, x, words)).read_text()
 
 
 def _ptx(library: Any, whole: str, words: tuple[str, ...]) -> bytes:
@@ -154,7 +154,7 @@ def key_of(whole: str, words: tuple[str, ...]) -> str:
     return hashlib.sha256("\0".join((whole, *words)).encode()).hexdigest()[:32]
 
 
-def _kept(whole: str, words: tuple[str, ...], kind: str, make: Callable[[str], bytes]) -> Path:
+def kept(whole: str, words: tuple[str, ...], kind: str, make: Callable[[str], bytes]) -> Path:
     """Returns the file of what was compiled; a process that is killed leaves no half of one."""
     folder = _folder()
     path = folder / f"{key_of(whole, words)}.{kind}"

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from purerl.exact.kernel.lanes import LANES
 
-AT_ONCE = 24  # numbers that a lane reads before it writes: each takes a register or two
+AT_ONCE = 40  # numbers that a lane reads before it writes: each takes a register or two
 MOST_PARTS = 4  # of a statement that is written out, without a loop
 
 

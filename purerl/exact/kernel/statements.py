@@ -14,9 +14,9 @@ import numpy as np
 from purerl.exact.kernel import values
 from purerl.exact.kernel.values import Held, Value, home
 
-# Numbers of a statement that is made one with others of its kind. More of them, and where each
-# reads is no longer said in a few instructions.
-MERGED = 32
+# Numbers of a statement that is made one with others of its kind. Larger ones are computed side by
+# side as they are, and need no table of where each reads (lab/2026-11-29-one-kernel-on-a-gpu.md).
+MERGED = 8
 # What stands for the memory of single constants, which a view mixes with numbers of values.
 SLOTS = Held((0,), "f", values.Block("top"))
 

@@ -106,7 +106,7 @@ def test_what_is_compiled_is_kept_by_all_that_it_depends_on(monkeypatch, tmp_pat
     monkeypatch.setattr(compilers, "_folder", lambda: tmp_path / "kernels")
     for _ in range(2):
         for whole, words in (("a", ("1",)), ("b", ("1",)), ("a", ("2",)), ("a", ("1", ""))):
-            path = compilers._kept(whole, words, "ptx", make)
+            path = compilers.kept(whole, words, "ptx", make)
             assert path.read_text() == whole
     assert made == ["a", "b", "a", "a"]
     assert len(list((tmp_path / "kernels").iterdir())) == 4
@@ -115,7 +115,7 @@ def test_what_is_compiled_is_kept_by_all_that_it_depends_on(monkeypatch, tmp_pat
 def test_a_compiler_that_fails_leaves_nothing(monkeypatch, tmp_path):
     monkeypatch.setattr(compilers, "_folder", lambda: tmp_path)
     with pytest.raises(ZeroDivisionError):
-        compilers._kept("a", (), "ptx", lambda _: 1 // 0)
+        compilers.kept("a", (), "ptx", lambda _: 1 // 0)
     assert not list(tmp_path.iterdir())
 
 

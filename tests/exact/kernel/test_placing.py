@@ -168,7 +168,7 @@ def text_of(function):
 
 def test_what_does_not_change_in_a_loop_is_computed_before_it():
     text = text_of(lambda x: lax.fori_loop(0, 3, lambda i, c: c * jnp.sin(x), x))
-    assert text.index("sinf") < text.index("ROUNDS(")
+    assert text.index("sinf") < text.index("REPEAT(")
 
 
 def test_a_branch_keeps_what_it_alone_computes():
@@ -184,6 +184,6 @@ def test_all_warps_of_a_block_wait_only_where_all_make_the_same_rounds():
         return lax.fori_loop(0, 3, lambda _, c: jnp.sin(c), x)
 
     text = text_of(newton)
-    begin, end = text.index("for (;;)"), text.rindex("ROUNDS(")
+    begin, end = text.index("for (;;)"), text.rindex("REPEAT(")
     assert "LOCKSTEP" not in text[begin:end].rsplit("}", 1)[0]
     assert "LOCKSTEP" in text[:begin] and "LOCKSTEP" in text[end:]
