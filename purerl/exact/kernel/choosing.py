@@ -11,7 +11,7 @@ import numpy as np
 
 from purerl.exact.kernel import compilers, compiling, launch
 
-# Environments of a block. With 5 an ant among gaps is 2.3 times as fast as by XLA and a humanoid 1.4
+# Environments of a block. With 5 an ant among gaps is 2.3 times as fast as by XLA, a humanoid 1.4
 # times (lab/2026-11-29-one-kernel-on-a-gpu.md); fewer have not been measured.
 FEWEST = 5
 
@@ -21,8 +21,8 @@ def with_kernel(
 ) -> Callable:
     """Returns `by_xla`, computed by one kernel of `f` where one can be had.
 
-    A kernel is compared with XLA's results before its first use on a machine. The derivative is that
-    of `by_xla`.
+    A kernel is compared with XLA's results before its first use on a machine. The derivative is
+    that of `by_xla`.
 
     Args:
       f: a pure function of pytrees, of one environment.
