@@ -175,7 +175,7 @@ class Physics:
     def stepped_by(self) -> tuple[str, ...]:
         """What computes steps, of those traced so far, where that is chosen: on a GPU, of `jax`.
 
-        "one kernel", or "XLA: " and why.
+        "one kernel" and who compiled it, or "XLA: " and why.
         """
         return tuple(getattr(self._engine, "stepped_by", ()))
 

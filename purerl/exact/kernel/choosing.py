@@ -29,14 +29,15 @@ def with_kernel(
       by_xla: the same, as XLA shall compute it without a kernel.
       reached: (*example) -> arguments of several environments with a leading axis, of the shapes of
         the example, and what XLA makes of them.
-      say: is told once for each set of shapes what computes it: "one kernel", or why it is XLA.
+      say: is told once for each set of shapes what computes it: "one kernel" and who compiled it,
+        or why it is XLA.
     """
 
     @functools.cache
     def kernel_of(tree: Any, shapes: tuple) -> compiling.Kernel | None:
         example = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*x) for x in shapes])
-        kernel, why = _tried(f, reached, example)
-        say(why or "one kernel")
+        kernel, said = _tried(f, reached, example)
+        say(said)
         return kernel
 
     @functools.wraps(by_xla)
@@ -53,9 +54,10 @@ def with_kernel(
 
 
 def _tried(f: Callable, reached: Callable, example: tuple) -> tuple[compiling.Kernel | None, str]:
-    """Returns a kernel that may be used, or None and why."""
+    """Returns a kernel that may be used, or None, and what `with_kernel` says."""
     try:
         kernel = compiling.compile_kernel(f, *example)
+        by = f"NVRTC {compilers.nvrtc_version()}" if launch.has_gpu() else "g++"
         fit = compilers.block_of(kernel.text, launch.capability()).environments
         if fit < FEWEST:
             return None, f"XLA: a block of this GPU has room for {fit} environments, of {FEWEST}"
@@ -66,7 +68,9 @@ def _tried(f: Callable, reached: Callable, example: tuple) -> tuple[compiling.Ke
         return None, f"XLA: {error}"
     except jax.errors.JaxRuntimeError as error:  # a driver that is older than NVRTC, for one
         return None, f"XLA: the kernel does not start, {str(error).splitlines()[0]}"
-    return (kernel, "") if found.agrees else (None, f"XLA: the kernel's results differ, {found}")
+    if not found.agrees:
+        return None, f"XLA: the kernel's results differ, {found}"
+    return kernel, f"one kernel, by {by}"
 
 
 def _known_agreement(

@@ -95,13 +95,17 @@ def on_cpu(text: Text) -> Callable[..., None]:
 
 def for_gpu(text: Text, chip: int) -> str:
     """Returns PTX of the kernel for a compute capability, as 90; CompilerError without NVRTC."""
-    library = _nvrtc()
-    version = [ctypes.c_int(), ctypes.c_int()]
-    library.nvrtcVersion(*map(ctypes.byref, version))
     words = (*GPU_WORDS, f"--gpu-architecture=compute_{chip}")
-    numbers = tuple(str(x.value) for x in version)
     whole = source(text, block_of(text, chip))
-    return kept(whole, (*numbers, *words), "ptx", lambda x: _ptx(library, x, words)).read_text()
+    about = nvrtc_version(), *words
+    return kept(whole, about, "ptx", lambda x: _ptx(_nvrtc(), x, words)).read_text()
+
+
+def nvrtc_version() -> str:
+    """Returns the version of NVRTC, on which a GPU's bits depend: it joins products and sums."""
+    version = [ctypes.c_int(), ctypes.c_int()]
+    _nvrtc().nvrtcVersion(*map(ctypes.byref, version))
+    return ".".join(str(x.value) for x in version)
 
 
 def _ptx(library: Any, whole: str, words: tuple[str, ...]) -> bytes:
