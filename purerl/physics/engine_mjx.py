@@ -67,12 +67,12 @@ class JaxEngine:
         platform = platform or device.platform
         self._exact_init = exact.rewrite(self.plain_init, platform=platform)
         self._exact_step = exact.rewrite(self.plain_step, platform=platform)
-        self.stepped_by: list[str] = []  # what computes a step, for each set of shapes
+        self.stepped_by: list[str] | None = None  # of `exact.with_kernel`
         if platform != "cpu" and self.data._impl.efc_J.size <= MOST_OF_A_KERNEL:
             self._by_xla = jax.jit(jax.vmap(self._exact_step))
-            say = self.stepped_by.append
+            self.stepped_by = []
             self._exact_step = exact.with_kernel(
-                self.plain_step, self._exact_step, self._reached, say
+                self.plain_step, self._exact_step, self._reached, self.stepped_by.append
             )
 
     def init(self, state: PyTree, changes: dict[str, Array], ctrl: Array | None = None) -> tuple:

@@ -172,12 +172,12 @@ class Physics:
         return self._engine.step(state, _float32(ctrl), self.check_changes(changes))
 
     @property
-    def stepped_by(self) -> tuple[str, ...]:
-        """What computes steps, of those traced so far, where that is chosen: on a GPU, of `jax`.
+    def stepped_by(self) -> list[str] | None:
+        """What computes the steps traced so far, or None where there is no choice.
 
-        "one kernel" and who compiled it, or "XLA: " and why.
+        On a GPU, of a small body on `jax`: "one kernel" and who compiled it, or "XLA: " and why.
         """
-        return tuple(getattr(self._engine, "stepped_by", ()))
+        return getattr(self._engine, "stepped_by", None)
 
     def derive(self, changes: dict[str, Array]) -> dict[str, Array]:
         """Returns changes with the constants that MuJoCo derives from them, such as `dof_M0`.

@@ -12,6 +12,7 @@ from typing import Any
 import jax
 
 from purerl import exact
+from purerl.checks import check_env
 from purerl.checks.held_arrays import hash_held
 from purerl.checks.user_code import users_errors
 from purerl.core.errors import UserError
@@ -122,7 +123,9 @@ def _facts(
     inexact = getattr(setup.env, "inexact", "")
     facts = manifest.describe_process(setup.engine, builders, kernels, shards.number, inexact)
     facts["model"] = objects.physics_hash(setup.env)
-    if stepped_by := getattr(getattr(setup.env, "physics", None), "stepped_by", ()):
+    stepped_by = getattr(getattr(setup.env, "physics", None), "stepped_by", None)
+    if stepped_by is not None:
+        check_env.check_shapes(setup.env)  # a step is traced, and so it is chosen
         facts["stepped_by"] = list(stepped_by)
     with objects.naming_broken_rules(setup.env):
         facts["arrays"] = hash_held(setup.env, setup.network)

@@ -1,5 +1,6 @@
 """Which of a function's two programs is run: one kernel, or XLA's. 20 s."""
 
+import json
 import re
 from functools import partial
 
@@ -9,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from purerl import exact
+from purerl import exact, run
 from purerl.exact.kernel import compilers
 from purerl.physics import engine_mjx
 from purerl.physics.interface import Physics
@@ -104,9 +105,34 @@ def test_a_gpus_engine_steps_by_a_kernel_what_is_small(monkeypatch):
         return jax.vmap(lambda *x: engine.step(*x[:2], {"body_mass": x[2]}))(states, ctrl, mass)
 
     results = [stepped(e) for e in (engine, physics._engine)]
-    assert engine.stepped_by == ["one kernel, by g++"] and physics.stepped_by == ()
+    assert engine.stepped_by == ["one kernel, by g++"] and physics.stepped_by is None
     for x, y in zip(*map(jax.tree.leaves, results), strict=True):
         np.testing.assert_allclose(x, y, 1e-5, 1e-6)
     assert len(set(np.ravel(results[0][0].qvel).tolist())) == 3, "each has a mass of its own"
     monkeypatch.setattr(engine_mjx, "MOST_OF_A_KERNEL", -1)
-    assert not hasattr(make(platform="interpreted"), "_by_xla")
+    assert make(platform="interpreted").stepped_by is None
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_a_run_says_what_steps_it(monkeypatch, tmp_path, capsys):
+    """20 s. As on a GPU, with the kernel's C++."""
+    plain = engine_mjx.JaxEngine.__init__
+    monkeypatch.setattr(
+        engine_mjx.JaxEngine, "__init__", lambda *x: plain(*x[:5], platform="interpreted")
+    )
+    words = [
+        "--engine",
+        "jax",
+        "--ppo.num-steps",
+        "256",
+        "--ppo.num-envs",
+        "8",
+        "--ppo.rollout-length",
+        "32",
+    ]
+    words += ["--ppo.num-minibatches", "2", "--evaluation.number", "0", "--runs", str(tmp_path)]
+    assert run.main(["cartpole_swingup", *words]) == 0
+    facts = json.loads((tmp_path / "cartpole_swingup/seed1/manifest.json").read_text())
+    assert facts["stepped_by"] == ["one kernel, by g++"]
+    assert "stepped by   one kernel, by g++" in capsys.readouterr().out
