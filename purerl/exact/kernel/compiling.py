@@ -1,7 +1,11 @@
 """`compile_kernel`: a function as one kernel, and the check that it computes the same."""
 
+import functools
+import hashlib
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -9,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
+from purerl.exact import traces
 from purerl.exact.kernel import compilers, launch, reading, text
 from purerl.exact.kernel.reading import Missing
 from purerl.exact.kernel.values import NoRuleError as NoRuleError
@@ -83,12 +88,31 @@ def compile_kernel(f: Callable, *example: Any) -> Kernel:
       NoRuleError: the first equation that no kernel computes; `kernel_missing` lists them all.
     """
     closed, inputs, shapes = _traced(f, *example)
-    return Kernel(text.written(reading.read(closed)), shapes, inputs)
+    return Kernel(_written(closed), shapes, inputs)
 
 
 def kernel_missing(f: Callable, *example: Any) -> list[Missing]:
     """Lists what of a function no kernel computes, and where it was written; nothing: all is."""
     return reading.missing(_traced(f, *example)[0])
+
+
+def _written(closed: core.ClosedJaxpr) -> text.Text:
+    """Returns the text of a trace, which is kept: to write it takes longer than to trace it."""
+    numbers = hashlib.sha256(_how_it_is_written())
+    for x in map(np.asarray, traces.constants(closed)):  # a trace's words have not all of them
+        numbers.update(f"{x.dtype}{x.shape}".encode() + x.tobytes())
+
+    def make(_: str) -> bytes:
+        return json.dumps(text.written(reading.read(closed))).encode()
+
+    path = compilers.kept(str(closed), (numbers.hexdigest(),), "text.json", make)
+    *found, inputs, outputs = json.loads(path.read_text())
+    return text.Text(*found, *(tuple(map(tuple, x)) for x in (inputs, outputs)))
+
+
+@functools.cache
+def _how_it_is_written() -> bytes:
+    return b"".join(x.read_bytes() for x in sorted(Path(traces.__file__).parent.rglob("*.py")))
 
 
 def _traced(f: Callable, *example: Any) -> tuple[core.ClosedJaxpr, Any, Any]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from purerl import exact
-from purerl.exact.kernel import compilers, launch
+from purerl.exact.kernel import compilers, compiling, launch
 from tests.exact.kernel import needs_compiler
 
 
@@ -110,6 +110,22 @@ def test_what_is_compiled_is_kept_by_all_that_it_depends_on(monkeypatch, tmp_pat
             assert path.read_text() == whole
     assert made == ["a", "b", "a", "a"]
     assert len(list((tmp_path / "kernels").iterdir())) == 4
+
+
+def test_a_text_is_kept_by_its_trace_and_its_constants(monkeypatch, tmp_path):
+    monkeypatch.setattr(compilers, "_folder", lambda: tmp_path)
+    plain, read = compiling.reading.read, []
+    monkeypatch.setattr(compiling.reading, "read", lambda x: read.append(x) or plain(x))
+
+    def made(table, factor):
+        table, x = np.float32(table), jnp.ones(3)
+        return exact.compile_kernel(lambda x: jnp.cos(x * table) * factor, x)
+
+    one, again = made([1, 2, 3], 0.1), made([1, 2, 3], 0.1)
+    assert len(read) == 1 and one.text == again.text and hash(one.text) == hash(again.text)
+    # They differ in a constant array that no trace shows, and in a digit that might not be shown.
+    others = made([1, 2, 4], 0.1), made([1, 2, 3], np.float32(0.1) + np.float32(1e-8))
+    assert len({one.text.body, *(x.text.body for x in others)}) == len(read) == 3
 
 
 def test_a_compiler_that_fails_leaves_nothing(monkeypatch, tmp_path):
