@@ -29,11 +29,12 @@ class ClipsOptions:
     allow: tuple[str, ...] = ()
     """Joints that only one of both has, the file and the body."""
     cut: tuple[str, float, float] | None = None
-    """A clip and its part from, to [s], such as Walk_12.p 1.0 2.5, to be written to --out."""
+    """A clip and its part from, to [s], such as Walk_12.p 1.0 2.5, to be written to --out, by
+    default cut.h5."""
     draw: str = ""
     """A clip: writes its video CLIP.mp4 and contact sheet CLIP.png here."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("cut.h5")
-    """The file that --cut writes."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """A file to write: what --cut takes or, without it, all clips, with their rate."""
 
 
 def command(options: ClipsOptions) -> None:
@@ -48,19 +49,19 @@ def command(options: ClipsOptions) -> None:
 
     motion = clip_files.read(options.file, options.rate, options.frames)
     if not options.body:
-        if options.cut or options.draw:
-            raise UserError("--cut and --draw need the body: give it, as --body rodent_run.")
+        if options.cut or options.draw or options.out:
+            raise UserError("--cut, --out, --draw need the body: give it, as --body rodent_run.")
         output.show(*(examine.about(motion, i) for i in range(len(motion.names))))
         return
     model = model_of(objects.build(loading.find(options.body)).env)
     clips = body.fit(motion, model, motion.rate, options.allow)
-    if options.cut:
-        files.check_new(options.out)
-        clip_files.write(options.out, records.cut(clips, *options.cut), model)
-        output.show(str(options.out))
+    if options.cut or options.out:
+        files.check_new(out := options.out or Path("cut.h5"))
+        clip_files.write(out, records.cut(clips, *options.cut) if options.cut else clips, model)
+        output.show(str(out))
     if options.draw:
         draw(records.cut(clips, options.draw), model)
-    if not (options.cut or options.draw):
+    if not (options.cut or options.out or options.draw):
         for line in examine.examine(motion, model, options.allow):
             output.show(line)
 

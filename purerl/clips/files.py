@@ -55,7 +55,10 @@ def read(path: Path | str, rate: float = 0.0, frames: int = 0) -> Motion:
         raise UserError(f"{path} {broken}: {reason(error)}{here}.") from error
     _check_values(path, motion)
     if not (motion.rate or rate) > 0.0:
-        raise UserError(f"{path} does not say its rate: give it, as rate=50 or --rate 50 [Hz].")
+        raise UserError(
+            f"{path} does not say its rate: give it, as rate=50 [Hz]. `python -m purerl.clips "
+            f"{path} --rate 50 --body BODY -o NEW.h5` writes a file that says it."
+        )
     if motion.rate and rate and motion.rate != rate:
         raise UserError(f"{path} is of {motion.rate:g} Hz, not {rate:g}: leave the rate out.")
     check_rate(motion.rate or rate)

@@ -49,6 +49,23 @@ def test_they_are_checked_cut_and_drawn_with_one(file, capsys, tmp_path, monkeyp
     assert (sheet[:240, :320] != sheet[-240:, -320:]).any(), "the pole turns"
 
 
+def test_a_file_without_a_rate_is_written_with_it(capsys, tmp_path, monkeypatch):
+    import h5py
+
+    monkeypatch.chdir(tmp_path)
+    with h5py.File("ours.h5", "w") as file:
+        file["qpos"] = np.linspace(0, 1, 80).reshape(40, 2)
+        file["names_qpos"] = np.array(["hinge", "slide"], "S")
+    words = ["ours.h5", *BODY, "--frames", "20"]
+    assert command.main(words) == 2
+    assert "--rate 50 --body BODY -o NEW.h5` writes a file" in capsys.readouterr().err
+    assert command.main([*words, "--rate", "100", "-o", "rated.h5"]) == 0
+    (ours, rated) = clips.read("ours.h5", 100.0, 20), clips.read("rated.h5")
+    assert rated.rate == 100.0 and rated.names == ours.names and len(rated.names) == 2
+    order = [rated.columns.index(name) for name in ours.columns]
+    np.testing.assert_allclose(rated.values[..., order], ours.values, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [

@@ -57,7 +57,8 @@ def _tried(f: Callable, reached: Callable, example: tuple) -> tuple[compiling.Ke
     """Returns a kernel that may be used, or None, and what `with_kernel` says."""
     try:
         kernel = compiling.compile_kernel(f, *example)
-        by = f"NVRTC {compilers.nvrtc_version()}" if launch.has_gpu() else "g++"
+        on_gpu = jax.default_backend() == "gpu"
+        by = f"NVRTC {compilers.nvrtc_version()}" if on_gpu else "g++"
         fit = compilers.block_of(kernel.text, launch.capability()).environments
         if fit < FEWEST:
             return None, f"XLA: a block of this GPU has room for {fit} environments, of {FEWEST}"

@@ -118,10 +118,5 @@ def capability() -> int:
     return int(str(found[0]).replace(".", "")) if found else WITHOUT_A_GPU
 
 
-def has_gpu() -> bool:
-    """Tells whether kernels run on a GPU here."""
-    return jax.default_backend() == "gpu"
-
-
 mlir.register_lowering(primitive, mlir.lower_fun(_with_number), platform="cuda")
 mlir.register_lowering(launched, _launch, platform="cuda")
