@@ -26,5 +26,7 @@ def for_gpu(physics):
     from purerl.physics.engine_mjx import JaxEngine
 
     old = physics._engine
-    physics._engine = JaxEngine(physics.model, old.record, old.late, old.substeps, platform=GPU)
+    engine = JaxEngine(physics.model, old.record, old.late, old.substeps, platform=GPU)
+    engine._exact_step = exact.rewrite(engine.plain_step, platform=GPU)  # small ones, too
+    physics._engine = engine
     return physics
