@@ -120,11 +120,15 @@ class JaxEngine:
         """
         state, ctrl, changes = example
         rng = np.random.default_rng(0)
-        alike = lambda x, like: np.tile(np.reshape(x, like.shape), (TRIED, *[1] * like.ndim))  # noqa: E731
-        begun = {n: alike(getattr(self.data, n), x) for n, x in vars(state).items()}
-        begun["qvel"] = begun["qvel"] + np.float32(0.1) * rng.normal(size=begun["qvel"].shape)
-        changes = {n: alike(getattr(self.model, n), x) for n, x in changes.items()}
-        states = state.replace(**{n: x.astype(np.float32) for n, x in begun.items()})
+
+        def several(x: Any, like: Any) -> np.ndarray:
+            return np.tile(np.reshape(x, like.shape), (TRIED, *[1] * like.ndim)).astype(like.dtype)
+
+        states = state.replace(
+            **{n: several(getattr(self.data, n), x) for n, x in vars(state).items()}
+        )
+        states.qvel[:] += 0.1 * rng.normal(size=states.qvel.shape)
+        changes = {n: several(getattr(self.model, n), x) for n, x in changes.items()}
         with mjx_defaults():
             for _ in range(TRIED_FOR):
                 ctrls = rng.uniform(-1, 1, (TRIED, *ctrl.shape)).astype(np.float32)
