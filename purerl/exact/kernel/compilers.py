@@ -171,6 +171,12 @@ def kept(whole: str, words: tuple[str, ...], kind: str, make: Callable[[str], by
     return path
 
 
+@functools.cache
+def how_texts_are_written() -> bytes:
+    """Returns the source of all that a text depends on besides its trace."""
+    return b"".join(x.read_bytes() for x in sorted(Path(__file__).parent.parent.rglob("*.py")))
+
+
 def _folder() -> Path:
     # Before "://" may stand who reads it. What then is no absolute path is of no folder here.
     cache = Path((jax.config.jax_compilation_cache_dir or "").rpartition("://")[2])

@@ -1,11 +1,9 @@
 """`compile_kernel`: a function as one kernel, and the check that it computes the same."""
 
-import functools
 import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -98,7 +96,7 @@ def kernel_missing(f: Callable, *example: Any) -> list[Missing]:
 
 def _written(closed: core.ClosedJaxpr) -> text.Text:
     """Returns the text of a trace, which is kept: to write it takes longer than to trace it."""
-    numbers = hashlib.sha256(_how_it_is_written())
+    numbers = hashlib.sha256(compilers.how_texts_are_written())
     for x in map(np.asarray, traces.constants(closed)):  # a trace's words have not all of them
         numbers.update(f"{x.dtype}{x.shape}".encode() + x.tobytes())
 
@@ -108,11 +106,6 @@ def _written(closed: core.ClosedJaxpr) -> text.Text:
     path = compilers.kept(str(closed), (numbers.hexdigest(),), "text.json", make)
     *found, inputs, outputs = json.loads(path.read_text())
     return text.Text(*found, *(tuple(map(tuple, x)) for x in (inputs, outputs)))
-
-
-@functools.cache
-def _how_it_is_written() -> bytes:
-    return b"".join(x.read_bytes() for x in sorted(Path(traces.__file__).parent.rglob("*.py")))
 
 
 def _traced(f: Callable, *example: Any) -> tuple[core.ClosedJaxpr, Any, Any]:
