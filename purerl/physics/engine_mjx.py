@@ -12,6 +12,7 @@ import numpy as np
 
 from purerl import exact
 from purerl.core.records import Array, PyTree
+from purerl.exact.pallas_calls import GPUS
 from purerl.physics.lookup import reading_shapes
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that warp, which is optional, is absent
@@ -68,7 +69,7 @@ class JaxEngine:
         self._exact_init = exact.rewrite(self.plain_init, platform=platform)
         self._exact_step = exact.rewrite(self.plain_step, platform=platform)
         self.stepped_by: list[str] | None = None  # of `exact.with_kernel`
-        if platform != "cpu" and self.data._impl.efc_J.size <= MOST_OF_A_KERNEL:
+        if platform in GPUS and self.data._impl.efc_J.size <= MOST_OF_A_KERNEL:
             self._by_xla = jax.jit(jax.vmap(self._exact_step))
             self.stepped_by = []
             self._exact_step = exact.with_kernel(

@@ -124,10 +124,10 @@ def _facts(
     facts = manifest.describe_process(setup.engine, builders, kernels, shards.number, inexact)
     facts["model"] = objects.physics_hash(setup.env)
     stepped_by = getattr(getattr(setup.env, "physics", None), "stepped_by", None)
-    if stepped_by is not None:
-        check_env.check_shapes(setup.env)  # a step is traced, and so it is chosen
-        facts["stepped_by"] = list(stepped_by)
     with objects.naming_broken_rules(setup.env):
+        if stepped_by is not None:
+            check_env.check_shapes(setup.env)  # a step is traced, and so it is chosen
+            facts["stepped_by"] = list(stepped_by)
         facts["arrays"] = hash_held(setup.env, setup.network)
     facts["experiment_file"] = str(source.path)
     if options.vmapped_seeds > 1:

@@ -34,8 +34,8 @@ class Cells:
 
     def turns(self, size: int) -> int:
         """Returns whose turn it is; so many numbers are a turn for each warp's worth of them."""
-        self.turn += -(-size // LANES)
-        return self.turn - -(-size // LANES)
+        turn, self.turn = self.turn, self.turn + -(-size // LANES)
+        return turn
 
     def memory(self, kind: str, place: str) -> str:
         """Returns C for a number in memory."""

@@ -59,12 +59,14 @@ def _tried(f: Callable, reached: Callable, example: tuple) -> tuple[compiling.Ke
         kernel = compiling.compile_kernel(f, *example)
         on_gpu = jax.default_backend() == "gpu"
         by = f"NVRTC {compilers.nvrtc_version()}" if on_gpu else "g++"
-        fit = compilers.block_of(kernel.text, launch.capability()).environments
-        if fit < FEWEST:
+        block = compilers.block_of(kernel.text, launch.capability())
+        if (fit := block.environments) < FEWEST:
             return None, f"XLA: a block of this GPU has room for {fit} environments, of {FEWEST}"
+        whole = compilers.source(kernel.text, block)
         # What is traced around this call is no business of the comparison: a thread has no trace.
         with concurrent.futures.ThreadPoolExecutor(1) as thread:
-            found = thread.submit(_known_agreement, kernel, reached, example).result()
+            compare = functools.partial(_compared, kernel, reached, example)
+            found = thread.submit(_known_agreement, whole, by, compare).result()
     except (compiling.NoRuleError, compilers.CompilerError) as error:
         return None, f"XLA: {error}"
     except jax.errors.JaxRuntimeError as error:  # a driver that is older than NVRTC, for one
@@ -74,17 +76,14 @@ def _tried(f: Callable, reached: Callable, example: tuple) -> tuple[compiling.Ke
     return kernel, f"one kernel, by {by}"
 
 
-def _known_agreement(
-    kernel: compiling.Kernel, reached: Callable, example: tuple
-) -> compiling.Agreement:
+def _known_agreement(whole: str, by: str, compare: Callable) -> compiling.Agreement:
     """Returns how a kernel agrees with XLA: XLA takes longer to compile, so it is kept."""
+    about = by, jax.__version__, str(launch.capability()), *compilers.GPU_WORDS
+    path = compilers.kept(whole, about, "json", lambda _: json.dumps(compare()).encode())
+    return compiling.Agreement(*json.loads(path.read_text()))
 
-    def compared(_: str) -> bytes:
-        args, wanted = reached(*example)
-        found = jax.jit(jax.vmap(kernel))(*args)
-        return json.dumps(compiling.agreement(*map(compiling.as_rows, (found, wanted)))).encode()
 
-    about = jax.__version__, str(launch.capability()), *compilers.GPU_WORDS
-    return compiling.Agreement(
-        *json.loads(compilers.kept(kernel.source, about, "json", compared).read_text())
-    )
+def _compared(kernel: compiling.Kernel, reached: Callable, example: tuple) -> compiling.Agreement:
+    args, wanted = reached(*example)
+    found = jax.jit(jax.vmap(kernel))(*args)
+    return compiling.agreement(*map(compiling.as_rows, (found, wanted)))
