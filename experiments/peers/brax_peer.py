@@ -145,7 +145,7 @@ def our_parts(chosen: Experiment) -> list[Part]:
     """Compiles the physics alone and our training, side by side, and makes the first update."""
     config, env, network, _ = objects.build(chosen)
     key = jax.random.key(chosen.seed)
-    abstract = abstract_state(config, env, network).env.physics
+    abstract = abstract_state(config, env, network).env_state.physics
     bare: Callable = partial(physics_alone, env, config.rollout_length)
     compiling = compilation.start("physics alone", jax.jit(bare).trace(abstract, key))
     never = Evaluation(number=0)
