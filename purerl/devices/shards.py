@@ -20,8 +20,9 @@ from jax.extend import core
 
 from purerl.core.parts import WHOLE, Parts, add_in_order
 from purerl.core.records import Array, Metrics, Network, PyTree, TrainState
+from purerl.devices import copies
 from purerl.devices.slices import SIDE_BY_SIDE, count_slices, cut_in_slices
-from purerl.exact import pallas_calls, traces
+from purerl.exact import traces
 from purerl.ppo import algorithm, learner
 from purerl.ppo.algorithm import Experience
 from purerl.ppo.config import Config
@@ -105,7 +106,7 @@ def set_apart(tree: PyTree) -> PyTree:
     """
     leaves, structure = jax.tree.flatten(tree)
     rows = [jnp.ravel(leaf) for leaf in leaves if leaf.size]
-    passed = iter(pallas_calls.copy(rows) if pallas_calls.can_run() else through_loop(rows))
+    passed = iter(copies.copy(rows) if copies.can_run() else through_loop(rows))
     apart = [next(passed).reshape(leaf.shape) if leaf.size else leaf for leaf in leaves]
     return jax.tree.unflatten(structure, apart)
 

@@ -2,8 +2,6 @@
 
 A GPU's kernel takes microseconds however little it computes, so each rule here makes fewer:
 
-- small linear systems have one kernel each (`fused_solves.py`), and so have line searches
-  (`fused_loops.py`);
 - a scatter that puts numbers in constant places is a gather (`scatters.py`);
 - short loops have some of their rounds written out, and read [n, 3] as [3, n].
 
@@ -13,24 +11,22 @@ for the host, which reads the condition. Unlike a `while`, a scan has a reverse-
 """
 
 from collections.abc import Iterator, Sequence
-from types import ModuleType
 from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
 from jax.extend import core
 
-from purerl.exact import constants, fused_loops, fused_solves, pallas_calls, walk
+from purerl.exact import constants, walk
 from purerl.exact.scatters import gathered_scatter, puts
-from purerl.exact.traces import equations, has_loop, with_own_derivative
+from purerl.exact.traces import equations, has_loop
 from purerl.exact.walk import Inside, Rule
 
 # A scan makes all its rounds. A loop that may make more than these most likely ends far earlier:
 # MuJoCo's default is 100 iterations, and a cart-pole needs two.
 MOST_ROUNDS = 16
 # Rounds written out one after another on a GPU, where every round copies the carry. With the four
-# rounds of its line search written out, an ant's physics was faster by 9% (H100). It matters for
-# loops that `fused_loops` does not take.
+# rounds of its line search written out, an ant's physics was faster by 9% (H100).
 WRITTEN_OUT = 4
 # Equations of a round to be written out. A line search has 300; a whole physics step, 6,000 for six
 # hinges, took three times as long to compile.
@@ -44,23 +40,9 @@ FEW_COLUMNS = 4
 def rules(platform: str) -> list[Rule]:
     """Returns the rules for programs of one platform."""
     counted = Rule(lambda eqn: eqn.primitive.name == "while", _scan_of_while)
-    if platform not in pallas_calls.GPUS:
+    if platform != "gpu":
         return [counted]
-    kernels = (fused_solves, fused_loops) if pallas_calls.can_run(platform) else ()
-    gathers, scans = Rule(puts, gathered_scatter), Rule(_is_short_or_reads_tall, _faster_scan)
-    return [*(_kernel(module, platform) for module in kernels), gathers, scans, counted]
-
-
-def _kernel(module: ModuleType, platform: str) -> Rule:
-    """Returns the rule that runs a module's kernel in the place of what the module wants.
-
-    The kernels have no derivative; that of the replaced equation is taken.
-    """
-
-    def replace(eqn: core.JaxprEqn, inputs: Sequence, inside: Inside) -> list:
-        return with_own_derivative(eqn, lambda *x: module.compute(eqn, platform, *x), inputs)
-
-    return Rule(module.wanted, replace)
+    return [Rule(puts, gathered_scatter), Rule(_is_short_or_reads_tall, _faster_scan), counted]
 
 
 # --- scans ---

@@ -12,7 +12,6 @@ import numpy as np
 
 from purerl import exact
 from purerl.core.records import Array, PyTree
-from purerl.exact.pallas_calls import GPUS
 from purerl.physics.lookup import reading_shapes
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that warp, which is optional, is absent
@@ -24,10 +23,10 @@ _IN_IMPL += ("subtree_angmom", "cacc", "cfrc_int", "cfrc_ext")
 # What MuJoCo computes with the sensors of accelerations: under RK4 at the first of four stages,
 # where MJX has the last; forces and accelerations are the last stage's.
 _OF_SENSORS = ("sensordata", "cacc", "cfrc_int", "cfrc_ext")
-# On a GPU a control step is one kernel if the Jacobian of its constraints has no more numbers. A
-# larger one takes a minute and more to write down, and gains less: a humanoid's, of 8,181, is 1.4
-# times as fast as XLA's (lab/2026-11-29-one-kernel-on-a-gpu.md).
-MOST_OF_A_KERNEL = 6000
+# On a GPU a control step is one kernel if the Jacobian of its constraints has no more numbers. That
+# of a humanoid has 8,181. A rodent's kernel is 1.4 times as fast as XLA's and takes two minutes to
+# make, where `warp` is 4 times as fast (lab/2026-11-29-one-kernel-on-a-gpu.md).
+MOST_OF_A_KERNEL = 10_000
 TRIED, TRIED_FOR = 64, 12  # simulations and control steps on which a kernel is compared with XLA
 
 
@@ -69,7 +68,7 @@ class JaxEngine:
         self._exact_init = exact.rewrite(self.plain_init, platform=platform)
         self._exact_step = exact.rewrite(self.plain_step, platform=platform)
         self.stepped_by: list[str] | None = None  # of `exact.with_kernel`
-        if platform in GPUS and self.data._impl.efc_J.size <= MOST_OF_A_KERNEL:
+        if platform == "gpu" and self.data._impl.efc_J.size <= MOST_OF_A_KERNEL:
             self._by_xla = jax.jit(jax.vmap(self._exact_step))
             self.stepped_by = []
             self._exact_step = exact.with_kernel(

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from purerl.core.errors import FAILURE, INTERRUPTED, SUCCESS, USAGE
-from purerl.devices import programs, shards
-from purerl.exact import pallas_calls, xla_flags
+from purerl.devices import copies, programs, shards
+from purerl.exact import xla_flags
 from purerl.experiment import objects
 from purerl.ppo.config import Evaluation
 from purerl.runs import checkpoint_folder
@@ -150,7 +150,7 @@ def test_the_check_of_a_persons_own_devices():
 
 @pytest.mark.parametrize("by_kernel", [False, True])
 def test_what_is_set_apart_stays_as_it_is(by_kernel, monkeypatch):
-    monkeypatch.setattr(pallas_calls, "can_run", lambda: by_kernel)
+    monkeypatch.setattr(copies, "can_run", lambda: by_kernel)
     tree = {
         "float": jnp.array([[0.0, -0.0], [jnp.inf, -1e-42]]),
         "half": jnp.array(1.5, jnp.bfloat16),
@@ -168,7 +168,7 @@ def test_what_is_set_apart_stays_as_it_is(by_kernel, monkeypatch):
 
 def test_a_shard_and_what_shards_send_are_copied_by_a_kernel(monkeypatch):
     """On a CPU bits are the same without, nearly always."""
-    monkeypatch.setattr(pallas_calls, "can_run", lambda: True)
+    monkeypatch.setattr(copies, "can_run", lambda: True)
     parts = shards.parts_of(shards.Shards(2))
     weight = jnp.ones(3)
     run = jax.make_jaxpr(lambda x: parts.sum(lambda y: (weight * y).sum(0), x))
@@ -180,7 +180,7 @@ def test_a_shard_and_what_shards_send_are_copied_by_a_kernel(monkeypatch):
     (loop,) = [e for e in closed.jaxpr.eqns if e.primitive.name == "scan"]
     assert passes(loop.params["jaxpr"].jaxpr) == [2, 1]  # the weight and the shard; the sum
     assert passes(closed.jaxpr) == [1]  # all sums
-    monkeypatch.setattr(pallas_calls, "AT_ONCE", 3)
+    monkeypatch.setattr(copies, "AT_ONCE", 3)
     assert passes(jax.make_jaxpr(shards.set_apart)([weight] * 7).jaxpr) == [3, 3, 1]
 
 

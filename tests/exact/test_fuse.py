@@ -154,14 +154,12 @@ def test_a_physics_step_for_a_gpu_is_the_same_step():
 
 def test_nothing_of_it_is_done_for_a_cpu_or_unless_asked():
     def function(x):
-        solved = jnp.linalg.cholesky(jnp.eye(3) + x[0])
-        return jax.lax.scan(lambda c, _: (jnp.sin(c) + solved[0], None), x, None, 5)[0].at[0].set(1)
+        return jax.lax.scan(lambda c, _: (jnp.sin(c), None), x, None, 5)[0].at[0].set(1)
 
     def steps(closed):
-        names = [name for name in ("pallas_call", "scatter", "cholesky") if named(closed, name)]
-        return names, [eqn.params["unroll"] for eqn in named(closed, "scan")]
+        return len(named(closed, "scatter")), [e.params["unroll"] for e in named(closed, "scan")]
 
     x = jnp.ones(3)
-    assert steps(rewritten(function, x)) == (["pallas_call"], [WRITTEN_OUT])
-    assert steps(rewritten(function, x, platform="cpu")) == (["scatter", "cholesky"], [1])
-    assert steps(rewritten(function, x, fuse=False)) == (["scatter", "cholesky"], [1])
+    assert steps(rewritten(function, x)) == (0, [WRITTEN_OUT])
+    assert steps(rewritten(function, x, platform="cpu")) == (1, [1])
+    assert steps(rewritten(function, x, fuse=False)) == (1, [1])

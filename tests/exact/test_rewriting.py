@@ -13,7 +13,7 @@ from mujoco import mjx
 
 from purerl import exact
 from tests import quick
-from tests.exact import GPU, named
+from tests.exact import named
 
 INDEX = np.array([0, 2, 2, 1, 0])
 
@@ -133,24 +133,6 @@ def test_a_derivative_of_the_users_own_is_kept(kind):
     assert not exact.unordered_sums(ours, x)
     assert_close(ours(x), plain(x))
     assert_close(jax.jit(jax.grad(ours))(x), jax.grad(plain)(x))
-
-
-def kernels(matrix, x):
-    """Has a solve and a loop that are kernels on a GPU."""
-    solved = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix), x)
-    body = lambda c, _: (c * 0.5 + (jnp.square(x) * c).sum() / 40, None)  # noqa: E731
-    return solved.sum() * jax.lax.scan(body, jnp.float32(0.3), None, 3)[0]
-
-
-def test_kernels_give_way_to_what_they_replace_when_differentiated():
-    rng = np.random.default_rng(0)
-    half = rng.normal(size=(9, 9))
-    args = jnp.asarray(half @ half.T + np.eye(9), jnp.float32), jnp.asarray(rng.normal(size=9))
-    ours = exact.rewrite(kernels, platform=GPU)
-    assert len(named(jax.make_jaxpr(ours)(*args), "pallas_call")) == 4
-    for derivative in (jax.grad, jax.jacfwd):
-        found = quick.jit(derivative(ours, (0, 1)))(*args)
-        assert_close(found, quick.jit(derivative(kernels, (0, 1)))(*args), 1e-4)
 
 
 # Two links, the second held by its limit: Newton's method makes several iterations.

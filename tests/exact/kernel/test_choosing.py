@@ -96,7 +96,7 @@ def test_xla_computes_what_no_kernel_can_and_says_why(function, why):
 def test_a_gpus_engine_steps_by_a_kernel_what_is_small(monkeypatch):
     physics = Physics(mujoco.MjModel.from_xml_string(PENDULUM), ("xpos",), 3, "jax")
     make = partial(engine_mjx.JaxEngine, physics.model, physics._engine.record, (), 3)
-    engine = make(platform="interpreted")
+    engine = make(platform="gpu")
     state, _ = physics.init(physics.model.qpos0, np.ones(1))
     mass = jnp.asarray(physics.model.body_mass, jnp.float32) * np.linspace(1, 2, 3)[:, None]
     states, ctrl = jax.tree.map(lambda x: jnp.stack([x] * 3), state), jnp.ones((3, 1))
@@ -110,7 +110,7 @@ def test_a_gpus_engine_steps_by_a_kernel_what_is_small(monkeypatch):
         np.testing.assert_allclose(x, y, 1e-5, 1e-6)
     assert len(set(np.ravel(results[0][0].qvel).tolist())) == 3, "each has a mass of its own"
     monkeypatch.setattr(engine_mjx, "MOST_OF_A_KERNEL", -1)
-    assert make(platform="interpreted").stepped_by is None
+    assert make(platform="gpu").stepped_by is None
 
 
 @needs_compiler
@@ -118,9 +118,7 @@ def test_a_gpus_engine_steps_by_a_kernel_what_is_small(monkeypatch):
 def test_a_run_says_what_steps_it(monkeypatch, tmp_path, capsys):
     """20 s. As on a GPU, with the kernel's C++."""
     plain = engine_mjx.JaxEngine.__init__
-    monkeypatch.setattr(
-        engine_mjx.JaxEngine, "__init__", lambda *x: plain(*x[:5], platform="interpreted")
-    )
+    monkeypatch.setattr(engine_mjx.JaxEngine, "__init__", lambda *x: plain(*x[:5], platform="gpu"))
     words = [
         "--engine",
         "jax",
