@@ -7,6 +7,7 @@ import gc
 import itertools
 import os
 import shutil
+import sys
 import tempfile
 
 # Reported cure for hangs of XLA's CPU pool on large vmapped programs (not of those that
@@ -18,6 +19,11 @@ os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
 COMPILED = os.path.join(tempfile.gettempdir(), "purerl-test-compilations")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", COMPILED)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
+# Python keeps what it compiled: each of some hundred processes compiles purerl in a second and a
+# half where it may not.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # A fork is refused where a mapping is larger than the memory; a rodent reserves 3 GB, untouched.
 os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
