@@ -47,10 +47,10 @@ hypothesis.settings.load_profile("same")
 
 jax.config.update("jax_debug_key_reuse", True)  # a key consumed twice raises
 
-# Files that take most, the longest first (274 to 45 s of a core, nothing compiled, 28 November
-# 2026): begun last, one would run alone at the end.
-LONGEST = ("shards", "run", "suite", "interface", "golden", "algorithm", "probes", "kill", "seeds")
-LONGEST += ("parts", "threads")
+# Files that take most, the longest first (460 to 45 s of a core, nothing compiled, 28 and 29
+# November 2026): begun last, one would run alone at the end.
+LONGEST = ("shards", "run", "suite", "models", "interface", "golden", "power_cuts", "algorithm")
+LONGEST += ("probes", "kill", "io_faults", "export", "seeds", "parts", "threads")
 
 # JAX keeps all that a process compiled: 6 GB in one of two at the end of all tests, and a machine
 # of 8 GB then starts no other program.
