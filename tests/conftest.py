@@ -7,6 +7,7 @@ import gc
 import itertools
 import os
 import shutil
+import sys
 import tempfile
 
 # Reported cure for hangs of XLA's CPU pool on large vmapped programs (not of those that
@@ -18,6 +19,11 @@ os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
 COMPILED = os.path.join(tempfile.gettempdir(), "purerl-test-compilations")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", COMPILED)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
+# Python keeps what it compiled: each of some hundred processes compiles purerl in a second and a
+# half where it may not.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # A fork is refused where a mapping is larger than the memory; a rodent reserves 3 GB, untouched.
 os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
@@ -41,10 +47,10 @@ hypothesis.settings.load_profile("same")
 
 jax.config.update("jax_debug_key_reuse", True)  # a key consumed twice raises
 
-# Files that take most, the longest first (274 to 45 s of a core, nothing compiled, 28 November
-# 2026): begun last, one would run alone at the end.
-LONGEST = ("shards", "run", "suite", "interface", "golden", "algorithm", "probes", "kill", "seeds")
-LONGEST += ("parts", "threads")
+# Files that take most, the longest first (460 to 45 s of a core, nothing compiled, 28 and 29
+# November 2026): begun last, one would run alone at the end.
+LONGEST = ("shards", "run", "suite", "models", "interface", "golden", "power_cuts", "algorithm")
+LONGEST += ("probes", "kill", "io_faults", "export", "seeds", "parts", "threads")
 
 # JAX keeps all that a process compiled: 6 GB in one of two at the end of all tests, and a machine
 # of 8 GB then starts no other program.

@@ -71,6 +71,7 @@ def test_a_portable_run_goes_on_as_one_and_names_no_processor(tmp_path):
     assert facts(half)["device"]["kind"] == kind and "allowed_changes" not in facts(half)
 
 
+@pytest.mark.usefixtures("compiled_quickly")
 def test_a_run_of_this_processor_does_not_go_on_as_a_portable_one(tmp_path):
     purerl.train(TOY, runs=tmp_path, name="own")
     done = command("--runs", str(tmp_path), "--name", "own", "--resume", "--portable")

@@ -81,7 +81,7 @@ def lines(folder: Path) -> list[dict]:
 def toy(tmp_path_factory) -> Path:
     """The folder of a run of 4 shards on one device."""
     runs = tmp_path_factory.mktemp("toy")
-    start(runs, 1, *SHARDED)
+    start(runs, 1, *SHARDED, flags=QUICKLY)
     return runs / "toy_experiment" / "seed1"
 
 
@@ -106,13 +106,13 @@ def test_physics_is_the_same_on_any_number_of_devices(tmp_path, engine, experime
 @pytest.mark.slow
 def test_a_run_is_the_same_on_as_many_devices_as_shards_and_goes_on_with_fewer(toy, tmp_path):
     """Without --num-shards: the run says how many it was begun with."""
-    start(tmp_path, 4, *SHARDED)
+    start(tmp_path, 4, *SHARDED, flags=QUICKLY)
     folder = tmp_path / "toy_experiment" / "seed1"
     assert lines(folder) == lines(toy)
     last = checkpoint_folder.updates(folder / "checkpoints")[-1]
     checkpoint_folder.discard(folder / "checkpoints" / f"{last:012d}")
     words = [str(TOY), "--ppo.num-envs", "16", "--checkpoints", "3"]
-    said = start(tmp_path, 2, *words, "--resume")
+    said = start(tmp_path, 2, *words, "--resume", flags=QUICKLY)
     assert "Resuming after update 4" in said and "2 on a device" in said
     assert lines(folder) == lines(toy)
 
@@ -205,7 +205,7 @@ def test_what_learns_from_several_shards_is_compiled_without_them(monkeypatch):
 
 @pytest.mark.slow
 def test_two_processes_are_as_one(toy, tmp_path):
-    first, second = both_end(start_two(tmp_path, *SHARDED), SUCCESS)
+    first, second = both_end(start_two(tmp_path, *SHARDED, flags=QUICKLY), SUCCESS)
     assert lines(tmp_path / "toy_experiment" / "seed1") == lines(toy)
     assert "Digest" in first and "update" not in second  # one speaks for both
 

@@ -17,6 +17,8 @@ from purerl.eyes.networks import windows
 from purerl.ppo import running_moments
 from purerl.report import numpy_policy, policy_npz
 
+pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly")
+
 LAB = eyes.Encoder(channels=(4, 8), kernels=(3, 3), strides=(1, 2), features=6)
 SEEN = {"policy": jnp.ones(3), "eyes": jnp.zeros((2, 12, 12), jnp.uint8), "privileged": jnp.ones(2)}
 NORMAL = SEEN | {"eyes": jnp.zeros((2, 12, 12))}

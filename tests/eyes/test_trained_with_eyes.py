@@ -14,7 +14,7 @@ from purerl.report.policy_npz import write_npz
 from purerl.report.policy_onnx import write_onnx
 from tests.docs.blocks import ROOT, blocks
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("file_is_compiled_quickly")]
 PAGE = ROOT / "docs" / "tutorials" / "your_eyes.md"
 WORDS = """
 --ppo.num-steps 256 --ppo.num-envs 8 --ppo.rollout-length 8 --ppo.num-minibatches 2 --checkpoints 4

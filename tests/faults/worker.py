@@ -92,6 +92,7 @@ def carry_out(
             traceback.print_exc()
         fired = shim.disarm()
         gc.collect()  # what an exception held, a lock among it, as at the end of a process
+        gc.freeze()  # what is left, most of it JAX's and its programs', is not looked through again
         stuck = busy_after(set(threading.enumerate()) - before)
     answer = {"code": code, "out": out.getvalue(), "err": err.getvalue(), "fired": fired}
     return answer | {"stuck": stuck, "seconds": time.monotonic() - begin}

@@ -168,6 +168,7 @@ def run(model, changes=None, steps=1, ctrl=(), engine="c"):
     return physics.step(state, jnp.array(ctrl, float), changes) if steps else (state, read)
 
 
+@pytest.mark.usefixtures("compiled_quickly")
 @pytest.mark.parametrize("engine", ["c", pytest.param("jax", marks=pytest.mark.slow)])
 def test_a_changed_model_moves_as_one_that_is_compiled_so(engine):
     load = mujoco.MjModel.from_xml_string

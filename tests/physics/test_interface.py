@@ -359,12 +359,18 @@ def test_look_ups_by_name():
 
 
 @functools.cache
-def step_trace(model, rewritten, readings=("xpos", "subtree_com", "cvel")):
+def engine_for(model, readings):
+    """Returns engine `jax`, which takes seconds to be made, and arguments of its step."""
     p = Physics(model, readings, substeps=2, engine="jax")
     p_c = Physics(model, (), substeps=2, engine="c")
     state, _ = jax.eval_shape(p_c.init, model.qpos0, np.zeros(model.nv))
-    arguments = (state, jnp.zeros(model.nu, jnp.float32), {})
-    return jax.make_jaxpr(p._engine.step if rewritten else p._engine.plain_step)(*arguments)
+    return p._engine, (state, jnp.zeros(model.nu, jnp.float32), {})
+
+
+@functools.cache
+def step_trace(model, rewritten, readings=("xpos", "subtree_com", "cvel")):
+    engine, arguments = engine_for(model, readings)
+    return jax.make_jaxpr(engine.step if rewritten else engine.plain_step)(*arguments)
 
 
 FORCES = ("cfrc_ext", "sensordata", "ten_length", "qfrc_actuator")

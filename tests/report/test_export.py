@@ -21,7 +21,7 @@ from purerl.report.policy_file import Recorded, control_range, origin, record_ep
 from tests.golden import privileged, recurrent
 from tests.test_readme import PAGES, blocks
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("file_is_compiled_quickly")]
 
 ROOT = Path(__file__).parent.parent.parent
 PYTHON = blocks(PAGES["docs/howto/export.md"].read_text(), "python")

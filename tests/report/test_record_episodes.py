@@ -20,6 +20,8 @@ from purerl.report import episode_arrays
 from purerl.runs import restored_run
 from tests.training.test_run import TOY
 
+pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly")
+
 TRAIN = """
 import dataclasses
 from purerl.experiments.cartpole_swingup import experiment

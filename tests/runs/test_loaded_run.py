@@ -22,6 +22,9 @@ from purerl.runs import loaded_run, policy
 from purerl.training import train
 from tests.golden import privileged, recurrent
 
+# All bits that are compared are of one process.
+pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly")
+
 ROOT = Path(__file__).parent.parent.parent
 FEW = {"ppo.num_steps": 512, "network.value_hidden": (8,), "evaluation.number": 0}
 

@@ -16,6 +16,9 @@ from purerl.machine.file_reads import reads_among
 from purerl.runs.packing import as_archive, unpack
 from tests.mistakes.play import MINE
 
+# Bits are compared with those of a run that is compiled so too.
+pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly")
+
 READS = """
     mujoco.MjModel.from_xml_path("bodies/arm.xml")
     goal = np.load("goal.npy")

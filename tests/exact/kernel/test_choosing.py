@@ -93,6 +93,7 @@ def test_xla_computes_what_no_kernel_can_and_says_why(function, why):
 
 
 @needs_compiler
+@pytest.mark.usefixtures("compiled_quickly")
 def test_a_gpus_engine_steps_by_a_kernel_what_is_small(monkeypatch):
     physics = Physics(mujoco.MjModel.from_xml_string(PENDULUM), ("xpos",), 3, "jax")
     make = partial(engine_mjx.JaxEngine, physics.model, physics._engine.record, (), 3)
@@ -115,6 +116,7 @@ def test_a_gpus_engine_steps_by_a_kernel_what_is_small(monkeypatch):
 
 @needs_compiler
 @pytest.mark.slow
+@pytest.mark.usefixtures("compiled_quickly")
 def test_a_run_says_what_steps_it(monkeypatch, tmp_path, capsys):
     """20 s. As on a GPU, with the kernel's C++."""
     plain = engine_mjx.JaxEngine.__init__

@@ -1,5 +1,7 @@
 """Control steps of MJX as kernels, against XLA's, on states that XLA has reached."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -14,6 +16,13 @@ from tests import quick
 from tests.exact.kernel import by_one_lane, by_warps, needs_compiler, rows
 
 N = 4  # environments
+
+
+@pytest.fixture
+def kernels_are_compiled_quickly(monkeypatch):
+    """g++ takes ten times as long to make a body's kernel faster as to make it at all."""
+    monkeypatch.setattr(compilers, "CPU_WORDS", [*compilers.CPU_WORDS, "-O0"])
+
 
 PENDULUM = """
 <mujoco>
@@ -91,6 +100,7 @@ MODELS = {
 def stepping(physics):
     """Returns the engine's own control step, whose changed fields of the model are inputs."""
 
+    @functools.partial(jax.jit, inline=True)  # traced once, for the kernel and for XLA
     def step(state, ctrl, changes):
         with mjx_defaults():
             return physics._engine.plain_step(state, ctrl, changes)
@@ -103,9 +113,9 @@ def start(physics, changed, seed=0):
     rng, model = np.random.default_rng(seed), physics.model
     qpos = np.tile(model.qpos0, (N, 1)).astype(np.float32)
     qvel = (0.3 * rng.normal(size=(N, model.nv))).astype(np.float32)
-    states = [
-        physics.init(jnp.asarray(p), jnp.asarray(v))[0] for p, v in zip(qpos, qvel, strict=True)
-    ]
+    # A state is the same on every engine, and to begin one on `jax` is to compile half of a step.
+    init = Physics(model, engine="c").init
+    states = [init(jnp.asarray(p), jnp.asarray(v))[0] for p, v in zip(qpos, qvel, strict=True)]
     state = jax.tree.map(lambda *x: np.stack(x), *states)
     fields = {n: np.asarray(getattr(model, n), np.float32) for n in changed}
     changes = {
@@ -134,6 +144,7 @@ def compared(physics, changed, control_steps):
 
 
 @needs_compiler
+@pytest.mark.usefixtures("kernels_are_compiled_quickly")
 @pytest.mark.parametrize(
     "name", ["pendulum", *(pytest.param(n, marks=pytest.mark.slow) for n in ("arm", "heap"))]
 )
@@ -161,6 +172,7 @@ def share_a_block(kernel):
 
 @needs_compiler
 @pytest.mark.slow
+@pytest.mark.usefixtures("kernels_are_compiled_quickly")
 @pytest.mark.parametrize("body, share, off", [("ant", 16, 0), ("humanoid", 4, 1e-3)])
 def test_a_bodys_control_step_is_xlas(tmp_path, body, share, off):
     """Five substeps and a task's readings, from the air to the floor: contacts come and go."""
