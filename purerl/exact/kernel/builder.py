@@ -24,6 +24,11 @@ MOST_WRITTEN_OUT = 1 << 17
 # one's terms: with fewer zeros than before, it is not made without them again.
 MANY_TERMS, MANY_ZEROS, SHORTEST = 4096, 2, 0.6
 FEW = 4  # numbers: one of so few is chosen, one of more is read from memory
+# A map of at least so many numbers is computed once for all that are equal, if each is there so
+# often: a box's edges, which MJX has for each pair of geoms.
+MANY, OFTEN = 64, 3
+# A map is computed for what is chosen of it alone, if it has so many times as many numbers.
+WIDE = 4
 # What a fold of nothing gives.
 NOTHING = {"add": 0, "mul": 1, "or": 0, "and": 1, "max": -np.inf, "min": np.inf}
 
@@ -94,6 +99,11 @@ class Builder:
         simple = self._simplified(op, kind, spread)
         if simple is not None:
             return simple
+        alike = _alike(spread, self.zeros)
+        if alike:
+            first, inverse = alike
+            once = self.map(op, *(self.take(x, first) for x in spread), kind=kind, param=param)
+            return self.take(once, inverse.reshape(shape))
         key = op, kind, tuple(map(id, spread)), param
         new = Map(shape, kind, self.top, op, spread, param)
         reads = [*spread, param] if isinstance(param, Value) else spread
@@ -115,6 +125,54 @@ class Builder:
             return self.map("lookup", index, kind=table.kind, param=table)
         rows = [self.spread(self.take(table, np.array(i)), index.shape) for i in range(table.size)]
         return self.select(index, *rows)
+
+    def choose(self, value: Value, options: np.ndarray, which: Value, of: np.ndarray) -> Value:
+        """Returns of each row of a value's places that with a number: [rows].
+
+        Maps are computed for these places alone, where that is less. What is the same in a row, or
+        in several, is there once.
+
+        Args:
+          value: to choose from.
+          options: [rows, places], what there is to choose.
+          which: numbers of places, each within a row.
+          of: [rows], which of these numbers is each row's.
+        """
+        rows, first, inverse = np.unique(
+            np.column_stack([of, options]), axis=0, return_index=True, return_inverse=True
+        )
+        if len(rows) < len(of):
+            once = self.choose(value, options[first], which, of[first])
+            return self.take(once, inverse.reshape(-1))
+        if (options == options[:, :1]).all():
+            return self.take(value, options[:, 0])
+        key = "chosen", id(value), options.tobytes(), id(which), of.tobytes()
+        if key not in self.blocks[-1].known:
+            self.blocks[-1].known[key] = self._chosen(value, options, which, of)
+        return self.blocks[-1].known[key]
+
+    def _chosen(self, value: Value, options: np.ndarray, which: Value, of: np.ndarray) -> Value:
+        if isinstance(value, View):
+            sources, index = value.which[options], value.index[options]
+            if (sources == sources[:, :1]).all():
+                parts, at = [], np.zeros(len(of), int)
+                for source in np.unique(sources[:, 0]):
+                    (here,) = np.nonzero(sources[:, 0] == source)
+                    parts.append(self.choose(value.sources[source], index[here], which, of[here]))
+                    at[here] = np.arange(len(here))
+                return self.view(parts, np.unique(sources[:, 0], return_inverse=True)[1], at)
+        wide = len(np.unique(options)) >= WIDE * len(of)
+        if isinstance(value, Map) and value.op != "lookup" and wide:
+            args = [self.choose(x, options, which, of) for x in value.args]
+            return self.map(value.op, *args, kind=value.kind, param=value.param)
+        number, steps = self.take(which, of), np.diff(options)
+        if (steps == steps[:, :1]).all():
+            number = self.map("mul", number, self.const(steps[:, 0].astype(np.int32)))
+            address = self.map("add", number, self.const(options[:, 0].astype(np.int32)))
+            return self.lookup(value, address)
+        starts = np.arange(len(of), dtype=np.int32) * options.shape[1]
+        address = self.map("add", number, self.const(starts))
+        return self.lookup(value, self.lookup(self.const(options.astype(np.int32)), address))
 
     def select(self, which: Value, first: Value, *others: Value) -> Value:
         """Returns of several values the one with a number, at each place."""
@@ -255,6 +313,31 @@ class Builder:
                 return self.view([x, y], zeros[0].astype(int).reshape(x.shape), x.places)
         same = {"sub": 0, "div": 1}
         return x if op in same and isinstance(y, Const) and y.is_all(same[op]) else None
+
+
+def _alike(args: Sequence[Value], zeros: Zeros) -> tuple[np.ndarray, np.ndarray] | None:
+    """Returns where numbers of a map stand first, and which of these each is; None if few are equal.
+
+    Known zeros are left to the sums, which leave them out.
+    """
+    size = args[0].size
+    if size < MANY or not all(isinstance(x, View | Const) for x in args):
+        return None
+    number = np.zeros(size, np.int64)
+    for x in args:
+        if not isinstance(x, Const) and zeros.of(x).any():
+            return None
+        bits = x.array.reshape(-1) if isinstance(x, Const) else x.which * (1 << 32) + x.index
+        bits = bits.view(np.int32) if bits.dtype == np.float32 else bits
+        _, part = np.unique(bits, return_inverse=True)
+        _, number = np.unique(number * (1 << 32) + part.reshape(-1), return_inverse=True)
+        if OFTEN * number.max() >= size:
+            return None
+    _, first, inverse = np.unique(number, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return first[order], rank[inverse]
 
 
 def _without_views(

@@ -101,11 +101,20 @@ def _gather(build: Builder, eqn: core.JaxprEqn, x: Value, indices: Value) -> Val
     at = np.arange(indices.size).reshape(-1, width)
     asked = [build.take(indices, at[:, k]) for k in range(width)]
     starts = [_within(build, s, most) for s, most in zip(asked, room, strict=True)]
-    address = _address(build, starts, [steps[i] for i in d.start_index_map])
-    row = np.broadcast_to(row, shape)
-    address = build.map("add", build.take(address, row), build.const(
-        np.broadcast_to(inside, shape).astype(np.int32)))  # fmt: skip
-    found = build.lookup(x, address)
+    row, inside = np.broadcast_to(row, shape), np.broadcast_to(inside, shape)
+    unknown = [i for i, start in enumerate(starts) if not isinstance(start, Const)]
+    apart = [steps[i] for i in d.start_index_map]
+    if len(unknown) == 1:
+        (one,) = unknown
+        for start, step in zip(starts, apart, strict=True):
+            if isinstance(start, Const):
+                inside = inside + start.array[row] * step
+        options = inside.reshape(-1, 1) + np.arange(room[one] + 1) * apart[one]
+        found = build.choose(x, options, starts[one], row.reshape(-1))
+        found = build.take(found, np.arange(row.size).reshape(shape))
+    else:
+        address = build.take(_address(build, starts, apart), row)
+        found = build.lookup(x, build.map("add", address, build.const(inside.astype(np.int32))))
     if p["mode"] != jax.lax.GatherScatterMode.FILL_OR_DROP:
         return found
     fits: Value = build.const(np.ones(len(at), bool))
