@@ -42,6 +42,7 @@ class Builder:
         self.blocks = [self.top]
         self.zeros = Zeros()
         self._constants: dict[Any, Const] = {}
+        self._apart: set[Value] = set()  # what was made of a stack's parts: see `_stacked`
 
     @contextlib.contextmanager
     def inside(self, role: str) -> Iterator[values.Block]:
@@ -99,6 +100,13 @@ class Builder:
         simple = self._simplified(op, kind, spread)
         if simple is not None:
             return simple
+        parts = self._stacked(spread)
+        if parts:
+            each = [[self.take(x, places) for x in spread] for places in parts]
+            found = [self.map(op, *some, kind=kind, param=param) for some in each]
+            self._apart |= set(found)
+            which, index = np.divmod(np.argsort(np.concatenate(parts)), len(parts[0]))
+            return self.view(found, which.reshape(shape), index.reshape(shape))
         alike = _alike(spread, self.zeros)
         if alike:
             first, inverse = alike
@@ -108,6 +116,25 @@ class Builder:
         new = Map(shape, kind, self.top, op, spread, param)
         reads = [*spread, param] if isinstance(param, Value) else spread
         return self._once(key, new, reads)
+
+    def _stacked(self, args: Sequence[Value]) -> list[np.ndarray]:
+        """Returns the places of each part of a stack of large maps, if there is one in `args`.
+
+        An operation on the whole would have all of them stand in memory, to be read once. It is
+        made part by part; what follows on that reads what stands.
+        """
+        for x in args:
+            if not isinstance(x, View) or len(x.sources) == 1:
+                continue
+            places = [np.flatnonzero(x.which == number) for number in range(len(x.sources))]
+            alike = min(map(len, places)) >= MANY and len(set(map(len, places))) == 1
+            some = zip(x.sources, places, strict=True)
+            if alike and all(
+                isinstance(y, Map) and y not in self._apart
+                and np.array_equal(np.sort(x.index[at]), np.arange(y.size)) for y, at in some
+            ):  # fmt: skip
+                return places
+        return []
 
     def standing(self, value: Value) -> Value:
         """Returns the value as one that can stand in memory by itself."""
