@@ -29,6 +29,8 @@ FEW = 4  # numbers: one of so few is chosen, one of more is read from memory
 MANY, OFTEN = 64, 3
 # A map is computed for what is chosen of it alone, if it has so many times as many numbers.
 WIDE = 4
+# Which places of a map are computed, part by part, and of each number its part and place in it.
+Parts = tuple[list[np.ndarray], np.ndarray, np.ndarray]
 # What a fold of nothing gives.
 NOTHING = {"add": 0, "mul": 1, "or": 0, "and": 1, "max": -np.inf, "min": np.inf}
 
@@ -100,41 +102,33 @@ class Builder:
         simple = self._simplified(op, kind, spread)
         if simple is not None:
             return simple
-        parts = self._stacked(spread)
-        if parts:
-            each = [[self.take(x, places) for x in spread] for places in parts]
+        fewer = self._stacked(spread) or _alike(spread, self.zeros)
+        if fewer:
+            parts, which, index = fewer
+            each = [[self.take(x, part) for x in spread] for part in parts]
             found = [self.map(op, *some, kind=kind, param=param) for some in each]
             self._apart |= set(found)
-            which, index = np.divmod(np.argsort(np.concatenate(parts)), len(parts[0]))
             return self.view(found, which.reshape(shape), index.reshape(shape))
-        alike = _alike(spread, self.zeros)
-        if alike:
-            first, inverse = alike
-            once = self.map(op, *(self.take(x, first) for x in spread), kind=kind, param=param)
-            return self.take(once, inverse.reshape(shape))
         key = op, kind, tuple(map(id, spread)), param
         new = Map(shape, kind, self.top, op, spread, param)
         reads = [*spread, param] if isinstance(param, Value) else spread
         return self._once(key, new, reads)
 
-    def _stacked(self, args: Sequence[Value]) -> list[np.ndarray]:
-        """Returns the places of each part of a stack of large maps, if there is one in `args`.
+    def _stacked(self, args: Sequence[Value]) -> Parts | None:
+        """Returns the parts of a stack of large maps, if there is one in `args`.
 
         An operation on the whole would have all of them stand in memory, to be read once. It is
         made part by part; what follows on that reads what stands.
         """
         for x in args:
-            if not isinstance(x, View) or len(x.sources) == 1:
-                continue
-            places = [np.flatnonzero(x.which == number) for number in range(len(x.sources))]
-            alike = min(map(len, places)) >= MANY and len(set(map(len, places))) == 1
-            some = zip(x.sources, places, strict=True)
-            if alike and all(
-                isinstance(y, Map) and y not in self._apart
-                and np.array_equal(np.sort(x.index[at]), np.arange(y.size)) for y, at in some
-            ):  # fmt: skip
-                return places
-        return []
+            if isinstance(x, View) and len(x.sources) > 1:
+                parts = [np.flatnonzero(x.which == number) for number in range(len(x.sources))]
+                sizes = {len(np.unique(x.index[part])) for part in parts} | {len(parts[0])}
+                sizes |= {y.size if isinstance(y, Map) else 0 for y in x.sources}
+                if len(sizes) == 1 and len(parts[0]) >= MANY and not self._apart & {*x.sources}:
+                    order = np.argsort(np.concatenate(parts))
+                    return parts, *np.divmod(order, len(parts[0]))
+        return None
 
     def standing(self, value: Value) -> Value:
         """Returns the value as one that can stand in memory by itself."""
@@ -165,9 +159,7 @@ class Builder:
           which: numbers of places, each within a row.
           of: [rows], which of these numbers is each row's.
         """
-        rows, first, inverse = np.unique(
-            np.column_stack([of, options]), axis=0, return_index=True, return_inverse=True
-        )
+        rows, first, inverse = _distinct([of, options])
         if len(rows) < len(of):
             once = self.choose(value, options[first], which, of[first])
             return self.take(once, inverse.reshape(-1))
@@ -179,27 +171,23 @@ class Builder:
         return self.blocks[-1].known[key]
 
     def _chosen(self, value: Value, options: np.ndarray, which: Value, of: np.ndarray) -> Value:
-        if isinstance(value, View):
-            sources, index = value.which[options], value.index[options]
-            if (sources == sources[:, :1]).all():
-                parts, at = [], np.zeros(len(of), int)
-                for source in np.unique(sources[:, 0]):
-                    (here,) = np.nonzero(sources[:, 0] == source)
-                    parts.append(self.choose(value.sources[source], index[here], which, of[here]))
-                    at[here] = np.arange(len(here))
-                return self.view(parts, np.unique(sources[:, 0], return_inverse=True)[1], at)
+        if isinstance(value, View) and not np.ptp(value.which[options], 1).any():
+            used, part = np.unique(value.which[options[:, 0]], return_inverse=True)
+            rows = [np.flatnonzero(part == number) for number in range(len(used))]
+            parts = [self.choose(value.sources[i], value.index[options[row]], which, of[row])
+                     for i, row in zip(used, rows, strict=True)]  # fmt: skip
+            index = np.argsort(np.argsort(part, kind="stable"))
+            return self.view(parts, part, index - np.searchsorted(np.sort(part), part))
         wide = len(np.unique(options)) >= WIDE * len(of)
         if isinstance(value, Map) and value.op != "lookup" and wide:
             args = [self.choose(x, options, which, of) for x in value.args]
             return self.map(value.op, *args, kind=value.kind, param=value.param)
-        number, steps = self.take(which, of), np.diff(options)
-        if (steps == steps[:, :1]).all():
-            number = self.map("mul", number, self.const(steps[:, 0].astype(np.int32)))
-            address = self.map("add", number, self.const(options[:, 0].astype(np.int32)))
-            return self.lookup(value, address)
-        starts = np.arange(len(of), dtype=np.int32) * options.shape[1]
-        address = self.map("add", number, self.const(starts))
-        return self.lookup(value, self.lookup(self.const(options.astype(np.int32)), address))
+        line = (np.diff(options, 2) == 0).all()  # else a place in a table of the options
+        at = options if line else np.arange(options.size).reshape(options.shape)
+        start, step = (self.const(x.astype(np.int32)) for x in (at[:, 0], at[:, 1] - at[:, 0]))
+        address = self.map("add", self.map("mul", self.take(which, of), step), start)
+        table = self.const(options.astype(np.int32))
+        return self.lookup(value, address if line else self.lookup(table, address))
 
     def select(self, which: Value, first: Value, *others: Value) -> Value:
         """Returns of several values the one with a number, at each place."""
@@ -342,29 +330,30 @@ class Builder:
         return x if op in same and isinstance(y, Const) and y.is_all(same[op]) else None
 
 
-def _alike(args: Sequence[Value], zeros: Zeros) -> tuple[np.ndarray, np.ndarray] | None:
-    """Returns where numbers of a map stand first, and which of these each is; None if few are equal.
+def _alike(args: Sequence[Value], zeros: Zeros) -> Parts | None:
+    """Returns the numbers of a map that are no others as its one part; None if most are no others.
 
     Known zeros are left to the sums, which leave them out.
     """
-    size = args[0].size
-    if size < MANY or not all(isinstance(x, View | Const) for x in args):
+    free = (isinstance(x, View) and not zeros.of(x).any() or isinstance(x, Const) for x in args)
+    if args[0].size < MANY or not all(free):
         return None
-    number = np.zeros(size, np.int64)
-    for x in args:
-        if not isinstance(x, Const) and zeros.of(x).any():
-            return None
-        bits = x.array.reshape(-1) if isinstance(x, Const) else x.which * (1 << 32) + x.index
-        bits = bits.view(np.int32) if bits.dtype == np.float32 else bits
-        _, part = np.unique(bits, return_inverse=True)
-        _, number = np.unique(number * (1 << 32) + part.reshape(-1), return_inverse=True)
-        if OFTEN * number.max() >= size:
-            return None
-    _, first, inverse = np.unique(number, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    return first[order], rank[inverse]
+    numbers = [x.which * (1 << 32) + x.index if isinstance(x, View) else _bits(x) for x in args]
+    _, first, number = _distinct(numbers)
+    if OFTEN * len(first) > len(number):
+        return None
+    order = np.argsort(first)  # as they come: places that follow each other need no table
+    return [first[order]], np.zeros_like(number), np.argsort(order)[number]
+
+
+def _bits(x: Value) -> np.ndarray:
+    assert isinstance(x, Const)
+    return x.array.reshape(-1).view(f"u{x.array.itemsize}").astype(np.int64)  # -0 is not 0
+
+
+def _distinct(columns: Sequence[np.ndarray]) -> Any:
+    """Returns distinct rows, where each is first, and which of them is at each place."""
+    return np.unique(np.column_stack(columns), True, True, axis=0)
 
 
 def _without_views(

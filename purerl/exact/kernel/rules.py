@@ -101,17 +101,16 @@ def _gather(build: Builder, eqn: core.JaxprEqn, x: Value, indices: Value) -> Val
     at = np.arange(indices.size).reshape(-1, width)
     asked = [build.take(indices, at[:, k]) for k in range(width)]
     starts = [_within(build, s, most) for s, most in zip(asked, room, strict=True)]
-    row, inside = np.broadcast_to(row, shape), np.broadcast_to(inside, shape)
-    unknown = [i for i, start in enumerate(starts) if not isinstance(start, Const)]
+    row, inside = (np.broadcast_to(x, shape) for x in (row, inside))
     apart = [steps[i] for i in d.start_index_map]
+    unknown = [i for i, start in enumerate(starts) if not isinstance(start, Const)]
     if len(unknown) == 1:
-        (one,) = unknown
-        for start, step in zip(starts, apart, strict=True):
-            if isinstance(start, Const):
-                inside = inside + start.array[row] * step
-        options = inside.reshape(-1, 1) + np.arange(room[one] + 1) * apart[one]
-        found = build.choose(x, options, starts[one], row.reshape(-1))
-        found = build.take(found, np.arange(row.size).reshape(shape))
+        i = unknown[0]
+        known = [y.array[row] * step for y, step in zip(starts, apart, strict=True)
+                 if isinstance(y, Const)]  # fmt: skip
+        options = np.arange(room[i] + 1) * apart[i] + np.sum([inside, *known], 0)[..., None]
+        found = build.choose(x, options.reshape(row.size, -1), starts[i], row.reshape(-1))
+        found = build.take(found, found.places.reshape(shape))
     else:
         address = build.take(_address(build, starts, apart), row)
         found = build.lookup(x, build.map("add", address, build.const(inside.astype(np.int32))))
