@@ -157,7 +157,7 @@ def chosen(x, i):
     parts += [
         jnp.take(jnp.cos(table), 3 * i, axis=0, mode="fill", fill_value=2.0),
         table[i, i],
-        (x * 0.0 + 1)[i],
+        x[INDEX][i],
     ]
     stack = jnp.stack([0.5 * x * x, x[0] * x, jnp.tanh(x)]) * x[::-1]
     signs = np.array([0.0, -0.0] * 50, np.float32)
