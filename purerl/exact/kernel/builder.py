@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from purerl.exact.kernel import lanes, values
+from purerl.exact.kernel import fewer, lanes, values
 from purerl.exact.kernel.operations import computed
 from purerl.exact.kernel.values import DTYPES, Const, Held, Map, Value, View, kind_of
 from purerl.exact.kernel.zeros import Zeros
@@ -24,13 +24,8 @@ MOST_WRITTEN_OUT = 1 << 17
 # one's terms: with fewer zeros than before, it is not made without them again.
 MANY_TERMS, MANY_ZEROS, SHORTEST = 4096, 2, 0.6
 FEW = 4  # numbers: one of so few is chosen, one of more is read from memory
-# A map of at least so many numbers is computed once for all that are equal, if each is there so
-# often: a box's edges, which MJX has for each pair of geoms.
-MANY, OFTEN = 64, 3
 # A map is computed for what is chosen of it alone, if it has so many times as many numbers.
 WIDE = 4
-# Which places of a map are computed, part by part, and of each number its part and place in it.
-Parts = tuple[list[np.ndarray], np.ndarray, np.ndarray]
 # What a fold of nothing gives.
 NOTHING = {"add": 0, "mul": 1, "or": 0, "and": 1, "max": -np.inf, "min": np.inf}
 
@@ -44,7 +39,7 @@ class Builder:
         self.blocks = [self.top]
         self.zeros = Zeros()
         self._constants: dict[Any, Const] = {}
-        self._apart: set[Value] = set()  # what was made of a stack's parts: see `_stacked`
+        self._apart: set[Value] = set()  # what was made of a stack's parts: see `fewer.py`
 
     @contextlib.contextmanager
     def inside(self, role: str) -> Iterator[values.Block]:
@@ -102,33 +97,17 @@ class Builder:
         simple = self._simplified(op, kind, spread)
         if simple is not None:
             return simple
-        fewer = self._stacked(spread) or _alike(spread, self.zeros)
-        if fewer:
-            parts, which, index = fewer
+        some = fewer.stacked(spread, self._apart) or fewer.alike(spread, self.zeros)
+        if some:
+            parts, which, index = some
             each = [[self.take(x, part) for x in spread] for part in parts]
-            found = [self.map(op, *some, kind=kind, param=param) for some in each]
+            found = [self.map(op, *xs, kind=kind, param=param) for xs in each]
             self._apart |= set(found)
             return self.view(found, which.reshape(shape), index.reshape(shape))
         key = op, kind, tuple(map(id, spread)), param
         new = Map(shape, kind, self.top, op, spread, param)
         reads = [*spread, param] if isinstance(param, Value) else spread
         return self._once(key, new, reads)
-
-    def _stacked(self, args: Sequence[Value]) -> Parts | None:
-        """Returns the parts of a stack of large maps, if there is one in `args`.
-
-        An operation on the whole would have all of them stand in memory, to be read once. It is
-        made part by part; what follows on that reads what stands.
-        """
-        for x in args:
-            if isinstance(x, View) and len(x.sources) > 1:
-                parts = [np.flatnonzero(x.which == number) for number in range(len(x.sources))]
-                sizes = {len(np.unique(x.index[part])) for part in parts} | {len(parts[0])}
-                sizes |= {y.size if isinstance(y, Map) else 0 for y in x.sources}
-                if len(sizes) == 1 and len(parts[0]) >= MANY and not self._apart & {*x.sources}:
-                    order = np.argsort(np.concatenate(parts))
-                    return parts, *np.divmod(order, len(parts[0]))
-        return None
 
     def standing(self, value: Value) -> Value:
         """Returns the value as one that can stand in memory by itself."""
@@ -148,18 +127,12 @@ class Builder:
         return self.select(index, *rows)
 
     def choose(self, value: Value, options: np.ndarray, which: Value, of: np.ndarray) -> Value:
-        """Returns of each row of a value's places that with a number: [rows].
+        """Returns of each row of a value's places, `options`, that with a number: [rows].
 
-        Maps are computed for these places alone, where that is less. What is the same in a row, or
-        in several, is there once.
-
-        Args:
-          value: to choose from.
-          options: [rows, places], what there is to choose.
-          which: numbers of places, each within a row.
-          of: [rows], which of these numbers is each row's.
+        Row i's number is `which[of[i]]`, within the row. Maps are computed for these places alone,
+        where that is less; what is the same in a row, or in several, is there once.
         """
-        rows, first, inverse = _distinct([of, options])
+        rows, first, inverse = fewer.distinct([of, options])
         if len(rows) < len(of):
             once = self.choose(value, options[first], which, of[first])
             return self.take(once, inverse.reshape(-1))
@@ -259,7 +232,7 @@ class Builder:
     def view(self, sources: Sequence[Value], which: np.ndarray, index: np.ndarray) -> Value:
         """Returns numbers of several values, in the shape of `index`: see `View`."""
         shape = index.shape
-        flat, which, index = _without_views(sources, which.reshape(-1), index.reshape(-1))
+        flat, which, index = fewer.without_views(sources, which.reshape(-1), index.reshape(-1))
         if not index.size:
             return self.const(np.zeros(shape, DTYPES[sources[0].kind]))
         if all(isinstance(x, Const) for x in flat):
@@ -328,55 +301,3 @@ class Builder:
                 return self.view([x, y], zeros[0].astype(int).reshape(x.shape), x.places)
         same = {"sub": 0, "div": 1}
         return x if op in same and isinstance(y, Const) and y.is_all(same[op]) else None
-
-
-def _alike(args: Sequence[Value], zeros: Zeros) -> Parts | None:
-    """Returns the numbers of a map that are no others as its one part; None if most are no others.
-
-    Known zeros are left to the sums, which leave them out.
-    """
-    free = (isinstance(x, View) and not zeros.of(x).any() or isinstance(x, Const) for x in args)
-    if args[0].size < MANY or not all(free):
-        return None
-    numbers = [x.which * (1 << 32) + x.index if isinstance(x, View) else _bits(x) for x in args]
-    _, first, number = _distinct(numbers)
-    if OFTEN * len(first) > len(number):
-        return None
-    order = np.argsort(first)  # as they come: places that follow each other need no table
-    return [first[order]], np.zeros_like(number), np.argsort(order)[number]
-
-
-def _bits(x: Value) -> np.ndarray:
-    assert isinstance(x, Const)
-    return x.array.reshape(-1).view(f"u{x.array.itemsize}").astype(np.int64)  # -0 is not 0
-
-
-def _distinct(columns: Sequence[np.ndarray]) -> Any:
-    """Returns distinct rows, where each is first, and which of them is at each place."""
-    return np.unique(np.column_stack(columns), True, True, axis=0)
-
-
-def _without_views(
-    sources: Sequence[Value], which: np.ndarray, index: np.ndarray
-) -> tuple[list[Value], np.ndarray, np.ndarray]:
-    """Returns a view's parts (see `View`) in terms of values that are no views, if any number."""
-    flat: list[Value] = []
-    numbers: dict[int, int] = {}  # of a value in `flat`, by its id
-    new_which, new_index = np.empty_like(which), np.empty_like(index)
-
-    def number_of(value: Value) -> int:
-        if id(value) not in numbers:
-            numbers[id(value)] = len(flat)
-            flat.append(value)
-        return numbers[id(value)]
-
-    for number in np.unique(which):
-        source, here = sources[number], which == number
-        if not isinstance(source, View):
-            new_which[here], new_index[here] = number_of(source), index[here]
-            continue
-        inner = source.which[index[here]]
-        new_index[here] = source.index[index[here]]
-        table = {i: number_of(source.sources[i]) for i in np.unique(inner)}
-        new_which[here] = np.vectorize(table.__getitem__, otypes=[int])(inner)
-    return flat, new_which, new_index

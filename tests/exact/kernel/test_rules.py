@@ -159,9 +159,10 @@ def chosen(x, i):
         table[i, i],
         x[INDEX][i],
     ]
+    uneven = jnp.concatenate([jnp.sin(x), jnp.tile(jnp.cos(x), 2)]) * x[0]  # no stack of maps
     stack = jnp.stack([0.5 * x * x, x[0] * x, jnp.tanh(x)]) * x[::-1]
     signs = np.array([0.0, -0.0] * 50, np.float32)
-    parts += [jnp.sin(stack) + stack[::-1], stack.sum(1), x[2] / signs]
+    parts += [jnp.sin(stack) + stack[::-1], uneven, stack.sum(1), x[2] / signs]
     return [*parts, lax.fori_loop(0, 3, lambda k, c: jnp.cos(c[:, None] * x)[:, k + i[0]], x[:20])]
 
 
