@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from purerl.exact.kernel import lanes, values
+from purerl.exact.kernel import fewer, lanes, values
 from purerl.exact.kernel.operations import computed
 from purerl.exact.kernel.values import DTYPES, Const, Held, Map, Value, View, kind_of
 from purerl.exact.kernel.zeros import Zeros
@@ -24,6 +24,8 @@ MOST_WRITTEN_OUT = 1 << 17
 # one's terms: with fewer zeros than before, it is not made without them again.
 MANY_TERMS, MANY_ZEROS, SHORTEST = 4096, 2, 0.6
 FEW = 4  # numbers: one of so few is chosen, one of more is read from memory
+# A map is computed for what is chosen of it alone, if it has so many times as many numbers.
+WIDE = 4
 # What a fold of nothing gives.
 NOTHING = {"add": 0, "mul": 1, "or": 0, "and": 1, "max": -np.inf, "min": np.inf}
 
@@ -37,6 +39,7 @@ class Builder:
         self.blocks = [self.top]
         self.zeros = Zeros()
         self._constants: dict[Any, Const] = {}
+        self._apart: set[Value] = set()  # what was made of a stack's parts: see `fewer.py`
 
     @contextlib.contextmanager
     def inside(self, role: str) -> Iterator[values.Block]:
@@ -94,6 +97,13 @@ class Builder:
         simple = self._simplified(op, kind, spread)
         if simple is not None:
             return simple
+        some = fewer.stacked(spread, self._apart) or fewer.alike(spread, self.zeros)
+        if some:
+            parts, which, index = some
+            each = [[self.take(x, part) for x in spread] for part in parts]
+            found = [self.map(op, *xs, kind=kind, param=param) for xs in each]
+            self._apart |= set(found)
+            return self.view(found, which.reshape(shape), index.reshape(shape))
         key = op, kind, tuple(map(id, spread)), param
         new = Map(shape, kind, self.top, op, spread, param)
         reads = [*spread, param] if isinstance(param, Value) else spread
@@ -115,6 +125,42 @@ class Builder:
             return self.map("lookup", index, kind=table.kind, param=table)
         rows = [self.spread(self.take(table, np.array(i)), index.shape) for i in range(table.size)]
         return self.select(index, *rows)
+
+    def choose(self, value: Value, options: np.ndarray, which: Value, of: np.ndarray) -> Value:
+        """Returns of each row of a value's places, `options`, that with a number: [rows].
+
+        Row i's number is `which[of[i]]`, within the row. Maps are computed for these places alone,
+        where that is less; what is the same in a row, or in several, is there once.
+        """
+        rows, first, inverse = fewer.distinct([of, options])
+        if len(rows) < len(of):
+            once = self.choose(value, options[first], which, of[first])
+            return self.take(once, inverse.reshape(-1))
+        if (options == options[:, :1]).all():
+            return self.take(value, options[:, 0])
+        key = "chosen", id(value), options.tobytes(), id(which), of.tobytes()
+        if key not in self.blocks[-1].known:
+            self.blocks[-1].known[key] = self._chosen(value, options, which, of)
+        return self.blocks[-1].known[key]
+
+    def _chosen(self, value: Value, options: np.ndarray, which: Value, of: np.ndarray) -> Value:
+        if isinstance(value, View) and not np.ptp(value.which[options], 1).any():
+            used, part = np.unique(value.which[options[:, 0]], return_inverse=True)
+            rows = [np.flatnonzero(part == number) for number in range(len(used))]
+            parts = [self.choose(value.sources[i], value.index[options[row]], which, of[row])
+                     for i, row in zip(used, rows, strict=True)]  # fmt: skip
+            index = np.argsort(np.argsort(part, kind="stable"))
+            return self.view(parts, part, index - np.searchsorted(np.sort(part), part))
+        wide = len(np.unique(options)) >= WIDE * len(of)
+        if isinstance(value, Map) and value.op != "lookup" and wide:
+            args = [self.choose(x, options, which, of) for x in value.args]
+            return self.map(value.op, *args, kind=value.kind, param=value.param)
+        line = (np.diff(options, 2) == 0).all()  # else a place in a table of the options
+        at = options if line else np.arange(options.size).reshape(options.shape)
+        start, step = (self.const(x.astype(np.int32)) for x in (at[:, 0], at[:, 1] - at[:, 0]))
+        address = self.map("add", self.map("mul", self.take(which, of), step), start)
+        table = self.const(options.astype(np.int32))
+        return self.lookup(value, address if line else self.lookup(table, address))
 
     def select(self, which: Value, first: Value, *others: Value) -> Value:
         """Returns of several values the one with a number, at each place."""
@@ -186,7 +232,7 @@ class Builder:
     def view(self, sources: Sequence[Value], which: np.ndarray, index: np.ndarray) -> Value:
         """Returns numbers of several values, in the shape of `index`: see `View`."""
         shape = index.shape
-        flat, which, index = _without_views(sources, which.reshape(-1), index.reshape(-1))
+        flat, which, index = fewer.without_views(sources, which.reshape(-1), index.reshape(-1))
         if not index.size:
             return self.const(np.zeros(shape, DTYPES[sources[0].kind]))
         if all(isinstance(x, Const) for x in flat):
@@ -255,29 +301,3 @@ class Builder:
                 return self.view([x, y], zeros[0].astype(int).reshape(x.shape), x.places)
         same = {"sub": 0, "div": 1}
         return x if op in same and isinstance(y, Const) and y.is_all(same[op]) else None
-
-
-def _without_views(
-    sources: Sequence[Value], which: np.ndarray, index: np.ndarray
-) -> tuple[list[Value], np.ndarray, np.ndarray]:
-    """Returns a view's parts (see `View`) in terms of values that are no views, if any number."""
-    flat: list[Value] = []
-    numbers: dict[int, int] = {}  # of a value in `flat`, by its id
-    new_which, new_index = np.empty_like(which), np.empty_like(index)
-
-    def number_of(value: Value) -> int:
-        if id(value) not in numbers:
-            numbers[id(value)] = len(flat)
-            flat.append(value)
-        return numbers[id(value)]
-
-    for number in np.unique(which):
-        source, here = sources[number], which == number
-        if not isinstance(source, View):
-            new_which[here], new_index[here] = number_of(source), index[here]
-            continue
-        inner = source.which[index[here]]
-        new_index[here] = source.index[index[here]]
-        table = {i: number_of(source.sources[i]) for i in np.unique(inner)}
-        new_which[here] = np.vectorize(table.__getitem__, otypes=[int])(inner)
-    return flat, new_which, new_index

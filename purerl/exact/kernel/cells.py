@@ -49,7 +49,8 @@ class Cells:
     def constant(self, numbers: np.ndarray, kind: str, place: str) -> str:
         """Returns C for constants; `place` is C for which of them."""
         first = numbers.flat[0]
-        if (numbers == first).all() or (numbers != numbers).all():
+        signs = 1.0 * np.signbit(numbers) if kind == "f" else 0  # -0 is not 0
+        if (numbers == first).all() and np.ptp(signs) == 0 or (numbers != numbers).all():
             return _literal(first, kind)
         return _of_table(kind, f"{self.tables.constant(numbers, kind)}+{place}")
 

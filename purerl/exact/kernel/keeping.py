@@ -124,7 +124,7 @@ def kept(top: Block, outputs: list[Value], zeros: Zeros) -> dict[Value, np.ndarr
     """
     items, repeated = list(in_order(top)), set[Value]()
     while True:
-        uses = _uses(top, outputs, items, repeated)
+        uses = _uses(top, outputs, items, repeated, zeros)
         more = _not_repeated(uses, items)
         if not more:
             return {value: _places(value, uses, zeros) for value in uses.keep}
@@ -138,7 +138,9 @@ def _places(value: Value, uses: Uses, zeros: Zeros) -> np.ndarray:
     return np.flatnonzero(others if much else read)
 
 
-def _uses(top: Block, outputs: list[Value], items: list[Any], repeated: set[Value]) -> Uses:
+def _uses(
+    top: Block, outputs: list[Value], items: list[Any], repeated: set[Value], zeros: Zeros
+) -> Uses:
     """Returns what is read where, if what is repeated and all that has to stand is kept."""
     uses = Uses()
     for value in outputs:
@@ -149,7 +151,7 @@ def _uses(top: Block, outputs: list[Value], items: list[Any], repeated: set[Valu
         elif uses.sites[item]:
             if item in repeated or _is_kept(item, uses):
                 uses.keep.add(item)
-            _add_args(uses, item)
+            _add_args(uses, item, _places(item, uses, zeros))
     return uses
 
 
@@ -181,9 +183,8 @@ def _add_step(uses: Uses, step: Step) -> None:
         uses.add(value, Site(value, block, value.places), stands=True)
 
 
-def _add_args(uses: Uses, item: Map | Fold) -> None:
-    """Notes what computing a value reads, where it is computed."""
-    places = np.flatnonzero(uses.read[item])
+def _add_args(uses: Uses, item: Map | Fold, places: np.ndarray) -> None:
+    """Notes what computing a value's numbers at places reads, where they are computed."""
     sites = [Site(item, item.block, places)]
     if isinstance(item, Fold):
         terms = item.arg.places.reshape(-1, item.terms)[places]

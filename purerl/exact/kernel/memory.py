@@ -78,7 +78,7 @@ class _Clock:
         self.now += 1
         for plan in statement.plans:
             self.read(plan.outside)
-        self.read(set(statement.writes))
+        self.read({*statement.writes, *statement.matrices})  # a solve may still read its matrix
 
 
 def placed(scheduler: Scheduler, inputs: Sequence[Held]) -> tuple[dict[Value, int], int]:

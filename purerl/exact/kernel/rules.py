@@ -101,11 +101,19 @@ def _gather(build: Builder, eqn: core.JaxprEqn, x: Value, indices: Value) -> Val
     at = np.arange(indices.size).reshape(-1, width)
     asked = [build.take(indices, at[:, k]) for k in range(width)]
     starts = [_within(build, s, most) for s, most in zip(asked, room, strict=True)]
-    address = _address(build, starts, [steps[i] for i in d.start_index_map])
-    row = np.broadcast_to(row, shape)
-    address = build.map("add", build.take(address, row), build.const(
-        np.broadcast_to(inside, shape).astype(np.int32)))  # fmt: skip
-    found = build.lookup(x, address)
+    row, inside = (np.broadcast_to(x, shape) for x in (row, inside))
+    apart = [steps[i] for i in d.start_index_map]
+    unknown = [i for i, start in enumerate(starts) if not isinstance(start, Const)]
+    if len(unknown) == 1:
+        i = unknown[0]
+        known = [y.array[row] * step for y, step in zip(starts, apart, strict=True)
+                 if isinstance(y, Const)]  # fmt: skip
+        options = np.arange(room[i] + 1) * apart[i] + np.sum([inside, *known], 0)[..., None]
+        found = build.choose(x, options.reshape(row.size, -1), starts[i], row.reshape(-1))
+        found = build.take(found, found.places.reshape(shape))
+    else:
+        address = build.take(_address(build, starts, apart), row)
+        found = build.lookup(x, build.map("add", address, build.const(inside.astype(np.int32))))
     if p["mode"] != jax.lax.GatherScatterMode.FILL_OR_DROP:
         return found
     fits: Value = build.const(np.ones(len(at), bool))

@@ -109,9 +109,53 @@ BAND = np.abs(np.subtract.outer(np.arange(60), np.arange(60))) < 3
 
 
 def masked(x):
-    y = jnp.sin(x)[:, None] * BAND  # its square and its products would all be computed anew
+    y = jnp.sin(x[:, None] + x) * BAND  # its square and its products would all be computed anew
     solved = jax.scipy.linalg.solve_triangular(y + 9 * np.eye(60, dtype=np.float32), x, lower=True)
-    return y @ y, jnp.cos(y)[::2].sum(), solved, (2 * y)[jnp.int32(50 * x[0])]  # of whole rows
+    return (
+        y @ y,
+        jnp.cos(y)[::2].sum(),
+        solved,
+        jax.lax.dynamic_slice(2 * y, (jnp.int32(50 * x[0]), 0), (1, 60)),
+    )
+
+
+def test_of_a_wide_map_only_what_is_chosen_is_computed_beside_what_chooses():
+    def function(x):
+        products = x[:, None] * x
+        wide = jnp.stack([jnp.sin(products), jnp.cos(products)], -1)  # [40, 40, 2]
+        best = jnp.tanh(wide[..., 0] * wide[..., 1]).argmin(1)
+        return jax.vmap(lambda row, i: row[i])(wide, best)
+
+    found = kept_of(function, LONG)
+    assert {one for one in found if one[1] > 40} == {("tanh", 1600)}
+    assert {("sin", 40), ("cos", 40)} < found
+
+
+def test_numbers_that_are_equal_are_computed_once():
+    def function(x):
+        pairs = jnp.cos(jnp.tile(x[:10], 8) * 2.0)  # eight pairs with the same box
+        return jnp.sin(pairs) * jnp.concatenate([x, x[::-1]]), jnp.exp(pairs)
+
+    assert {size for op, size in kept_of(function, LONG) if op in ("cos", "exp", "sin")} == {10}
+
+
+def test_the_parts_of_a_stack_do_not_stand_in_memory_to_be_read_once():
+    def function(x):
+        stack = jnp.stack([jnp.sin(x), jnp.cos(x), x * x]) * x[::-1]
+        return stack.sum(1), (stack[::-1] * x).sum(1)
+
+    x = np.linspace(0.1, 1, 100).astype(np.float32)
+    assert {op for op, size in kept_of(function, x) if size >= 100} == {"mul"}
+
+
+def test_what_is_multiplied_by_known_zeros_alone_is_not_computed():
+    def function(x):
+        other = jnp.sin(x[:, None] + x[::-1])
+        y = jnp.exp(other) * BAND
+        return y @ y, jnp.cos(y)[::2].sum(), y[3] * other[3, 5]
+
+    found = kept_of(function, np.linspace(0.1, 1, 60).astype(np.float32))
+    assert {("mul", BAND.sum()), ("sin", BAND.sum())} < found
 
 
 @needs_compiler

@@ -145,6 +145,27 @@ def looked_up(x, i):
     return [*parts, x[INDEX], x.reshape(5, 2)[INDEX, 1]]
 
 
+def chosen(x, i):
+    """Of wide maps a few numbers; of stacks, in no line, many alike, and out of bounds."""
+    table = jnp.sin(x[:40].reshape(8, 5, 1) + np.arange(1, 13, dtype=np.float32) * x[0])
+    whole = jnp.stack([jnp.cross(table[..., k : k + 3], x[:3]) for k in range(2)], 1)
+    size = jnp.sqrt((whole**2).sum(-1, keepdims=True))
+    alike = jnp.exp(x[40:52].reshape(1, 12) * jnp.ones((9, 1))) / jnp.exp(x[:9].sum())
+    best = jnp.abs(size[..., 0]).argmin(-1)
+    parts = [jax.vmap(jax.vmap(lambda row, k: row[k]))(whole / size, best), (whole / size)[i[0]]]
+    parts += [jnp.take(jnp.cos(table[:, INDEX]), i, axis=1, mode="clip"), alike, alike[i]]
+    parts += [
+        jnp.take(jnp.cos(table), 3 * i, axis=0, mode="fill", fill_value=2.0),
+        table[i, i],
+        x[INDEX][i],
+    ]
+    uneven = jnp.concatenate([jnp.sin(x), jnp.tile(jnp.cos(x), 2)]) * x[0]  # no stack of maps
+    stack = jnp.stack([0.5 * x * x, x[0] * x, jnp.tanh(x)]) * x[::-1]
+    signs = np.array([0.0, -0.0] * 50, np.float32)
+    parts += [jnp.sin(stack) + stack[::-1], uneven, stack.sum(1), x[2] / signs]
+    return [*parts, lax.fori_loop(0, 3, lambda k, c: jnp.cos(c[:, None] * x)[:, k + i[0]], x[:20])]
+
+
 def ordered(x, i):
     pairs = lax.sort((i, x), num_keys=2)
     return [
@@ -282,6 +303,7 @@ def drawn(x):
 
 FUNCTIONS = {
     "branches": (branches, real(4), whole(1)),
+    "chosen": (chosen, real(100), whole(5, least=0, most=5)),
     "drawn": (drawn, real(4, 4)),
     "factors": (factors, real(4, 4)),
     "in_rounds": (in_rounds, real(12)),
