@@ -55,22 +55,25 @@ def with_kernel(
 
 def _tried(f: Callable, reached: Callable, example: tuple) -> tuple[compiling.Kernel | None, str]:
     """Returns a kernel that may be used, or None, and what `with_kernel` says."""
-    try:
-        kernel = compiling.compile_kernel(f, *example)
-        on_gpu = jax.default_backend() == "gpu"
-        by = f"NVRTC {compilers.nvrtc_version()}" if on_gpu else "g++"
-        block = compilers.block_of(kernel.text, launch.capability())
-        if (fit := block.environments) < FEWEST:
-            return None, f"XLA: a block of this GPU has room for {fit} environments, of {FEWEST}"
-        whole = compilers.source(kernel.text, block)
-        # What is traced around this call is no business of the comparison: a thread has no trace.
-        with concurrent.futures.ThreadPoolExecutor(1) as thread:
-            compare = functools.partial(_compared, kernel, reached, example)
-            found = thread.submit(_known_agreement, whole, by, compare).result()
-    except (compiling.NoRuleError, compilers.CompilerError) as error:
-        return None, f"XLA: {error}"
-    except jax.errors.JaxRuntimeError as error:  # a driver that is older than NVRTC, for one
-        return None, f"XLA: the kernel does not start, {str(error).splitlines()[0]}"
+    # What is traced around this call is no business of the comparison: a thread has no trace. XLA
+    # compiles there while a new text is written.
+    with concurrent.futures.ThreadPoolExecutor(2) as threads:
+        by_xla = functools.cache(functools.partial(threads.submit, reached, *example))
+        try:
+            kernel = compiling.compile_kernel(f, *example, meanwhile=by_xla)
+            on_gpu = jax.default_backend() == "gpu"
+            by = f"NVRTC {compilers.nvrtc_version()}" if on_gpu else "g++"
+            block = compilers.block_of(kernel.text, launch.capability())
+            if (fit := block.environments) < FEWEST:
+                said = f"a block of this GPU has room for {fit} environments, of {FEWEST}"
+                return None, f"XLA: {said}"
+            whole = compilers.source(kernel.text, block)
+            compare = functools.partial(_compared, kernel, by_xla)
+            found = threads.submit(_known_agreement, whole, by, compare).result()
+        except (compiling.NoRuleError, compilers.CompilerError) as error:
+            return None, f"XLA: {error}"
+        except jax.errors.JaxRuntimeError as error:  # a driver that is older than NVRTC, for one
+            return None, f"XLA: the kernel does not start, {str(error).splitlines()[0]}"
     if not found.agrees:
         return None, f"XLA: the kernel's results differ, {found}"
     return kernel, f"one kernel, by {by}"
@@ -83,7 +86,7 @@ def _known_agreement(whole: str, by: str, compare: Callable) -> compiling.Agreem
     return compiling.Agreement(*json.loads(path.read_text()))
 
 
-def _compared(kernel: compiling.Kernel, reached: Callable, example: tuple) -> compiling.Agreement:
-    args, wanted = reached(*example)
+def _compared(kernel: compiling.Kernel, by_xla: Callable) -> compiling.Agreement:
+    args, wanted = by_xla().result()
     found = jax.jit(jax.vmap(kernel))(*args)
     return compiling.agreement(*map(compiling.as_rows, (found, wanted)))

@@ -71,7 +71,9 @@ TOLERANCE = 1e-3
 MOST_OFF = 0.01
 
 
-def compile_kernel(f: Callable, *example: Any) -> Kernel:
+def compile_kernel(
+    f: Callable, *example: Any, meanwhile: Callable[[], Any] = lambda: None
+) -> Kernel:
     """Returns a function as one kernel: on a GPU a warp for each environment, on a CPU C++.
 
     It is traced and written here, and compiled when it is first called. Loops that depend on data
@@ -81,12 +83,13 @@ def compile_kernel(f: Callable, *example: Any) -> Kernel:
     Args:
       f: a pure function of pytrees of float32, int32 and bool arrays, of one environment.
       *example: its arguments, or `jax.ShapeDtypeStruct`s of the same shapes.
+      meanwhile: is called before a text is written, which takes seconds, and not if one is kept.
 
     Raises:
       NoRuleError: the first equation that no kernel computes; `kernel_missing` lists them all.
     """
     closed, inputs, shapes = _traced(f, *example)
-    return Kernel(_written(closed), shapes, inputs)
+    return Kernel(_written(closed, meanwhile), shapes, inputs)
 
 
 def kernel_missing(f: Callable, *example: Any) -> list[Missing]:
@@ -94,14 +97,16 @@ def kernel_missing(f: Callable, *example: Any) -> list[Missing]:
     return reading.missing(_traced(f, *example)[0])
 
 
-def _written(closed: core.ClosedJaxpr) -> text.Text:
+def _written(closed: core.ClosedJaxpr, meanwhile: Callable[[], Any]) -> text.Text:
     """Returns the text of a trace, which is kept: to write it takes longer than to trace it."""
     numbers = hashlib.sha256(compilers.how_texts_are_written())
     for x in map(np.asarray, traces.constants(closed)):  # a trace's words have not all of them
         numbers.update(f"{x.dtype}{x.shape}".encode() + x.tobytes())
 
     def make(_: str) -> bytes:
-        return json.dumps(text.written(reading.read(closed))).encode()
+        program = reading.read(closed)
+        meanwhile()
+        return json.dumps(text.written(program)).encode()
 
     path = compilers.kept(str(closed), (numbers.hexdigest(),), "text.json", make)
     *found, inputs, outputs = json.loads(path.read_text())

@@ -25,7 +25,7 @@ static inline float __int_as_float(int bits) { float x; std::memcpy(&x, &bits, 4
 
 struct Fiber {
   ucontext_t context;
-  std::vector<char> stack = std::vector<char>(1 << 16);
+  std::vector<char> stack = std::vector<char>(1 << 18);
   int waits = 0;  // for a warp (1), for those at barrier b (2 + b; 0: the block); -1: it is over
   float box;
 };
