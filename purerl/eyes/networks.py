@@ -9,8 +9,7 @@ import jax.numpy as jnp
 from purerl.core.records import Array, Network, PolicyOutput, PyTree
 from purerl.ppo import networks
 
-# Entries of an observation: [E, H, W], and what only the value function reads, [O].
-PICTURES, UNSEEN = "eyes", "privileged"
+PICTURES = "eyes"  # the observation's entry, [E, H, W]
 
 
 @dataclass(frozen=True)
@@ -27,8 +26,6 @@ class Encoder:
     """What it says of each eye's picture."""
     shared: bool = True
     """Whether all eyes have one encoder, or each its own."""
-    tells: bool = False
-    """Whether from what it says the observation's `privileged` is guessed: a loss, `sight`."""
 
     def __post_init__(self) -> None:
         """Refuses layers without a stride, and strides without a layer."""
@@ -108,15 +105,7 @@ class Seeing(nn.Module):
         seen = [encoders[i % len(encoders)](pictures[..., i, :, :]) for i in range(number)]
         rest = {name: x for name, x in observation.items() if name != PICTURES}
         joined = jnp.concatenate([rest["policy"], *seen], axis=-1)
-        answer = self.network(rest | {"policy": joined}, *memory)
-        if not self.options.tells:
-            return answer
-        output, *others = (answer,) if isinstance(answer, PolicyOutput) else answer
-        unseen = rest[UNSEEN]
-        guess = nn.Dense(unseen.shape[-1], name="guess")(jnp.concatenate(seen, axis=-1))
-        losses = output.losses | {"sight": jnp.square(guess - unseen).mean(-1)}
-        output = output._replace(losses=losses)
-        return output if not others else (output, *others)
+        return self.network(rest | {"policy": joined}, *memory)
 
 
 def mlp(options: MlpOptions, observation: PyTree, action_size: int) -> Network:

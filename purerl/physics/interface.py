@@ -175,7 +175,7 @@ class Physics:
     def stepped_by(self) -> list[str] | None:
         """What computes the steps traced so far, or None where there is no choice.
 
-        On a GPU, of a small body on `jax`: "one kernel" and who compiled it, or "XLA: " and why.
+        On a GPU, up to a humanoid's size on `jax`: "one kernel" and who compiled it, or "XLA: " and why.
         """
         return getattr(self._engine, "stepped_by", None)
 
