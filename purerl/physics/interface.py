@@ -175,7 +175,8 @@ class Physics:
     def stepped_by(self) -> list[str] | None:
         """What computes the steps traced so far, or None where there is no choice.
 
-        On a GPU, up to a humanoid's size on `jax`: "one kernel" and who compiled it, or "XLA: " and why.
+        On a GPU, on `jax`, up to a humanoid's size: "one kernel" and who compiled it, or "XLA: "
+        and why.
         """
         return getattr(self._engine, "stepped_by", None)
 

@@ -95,7 +95,7 @@ def ask(runs: dict[str, Any], asked: Sequence[Case], options: Any) -> Iterator[A
             about["lesion"] = " ".join([lesion.kind, *lesion.layer]) if units else "intact"
             about["strength"] = lesion.strength if units else None
             key = derive(jax.random.key(seed), Purpose.EVALUATION)
-            yield about, jax.device_get(judge(state, key))
+            yield about, named(setup.env, jax.device_get(judge(state, key)))
 
 
 def setup_of(experiment: Experiment, run: Any) -> Setup:
@@ -132,6 +132,7 @@ def program(setup: Setup, state: TrainState, options: Any) -> Callable[..., Any]
     """Returns a program of (state, key) -> the figures of an `Answer`.
 
     What an episode has of the option that varies is a metric, or a number of `task`, of its name.
+    Of imitation there is `clip`, the number of the clip that it follows.
     """
     config, env, network, _ = setup
     sizes = {"num_episodes": options.episodes, "episode_length": config.episode_length}
@@ -144,11 +145,18 @@ def program(setup: Setup, state: TrainState, options: Any) -> Callable[..., Any]
         paths = zip(leaf_paths(told), jax.tree.leaves(told), strict=True)
         had = {path.split("/")[-1]: x for path, x in paths if x.ndim == 1}
         own = {options.varied: had[option]} if option in had else {}
+        own |= {"clip": had["clip"]} if "clip" in had and hasattr(env, "names") else {}
         return own | evaluation.evaluate_policy(env, network, state, key, **sizes)
 
     if options.outcome not in (names := jax.eval_shape(judge, state, jax.random.key(0))):
         raise UserError(unknown_name("outcome", options.outcome, sorted(names)))
     return jax.jit(judge)
+
+
+def named(env: Any, figures: dict[str, Any]) -> dict[str, Any]:
+    """Returns the figures with each clip's name in the place of its number."""
+    clips = {name: np.array(env.names)[x] for name, x in figures.items() if name == "clip"}
+    return figures | clips
 
 
 def summarize(answers: Sequence[Answer], outcome: str) -> list[dict[str, Any]]:
@@ -183,7 +191,9 @@ def draw(path: Path, rows: Sequence[dict[str, Any]], varied: str, outcome: str) 
             style = {"color": f"C{colors.index(lesion)}", "alpha": alpha, "marker": "o"}
             label = printable(f"{run} {lesion}")
             axes.errorbar(x, y, abs(ends - y), label=label, capsize=3, **style)
-        axes.set(xlabel=varied, ylabel=outcome, title="Mean, and 95% interval from 5 values on")
+        told = {row["lesion"] for row in rows if varied.startswith("lesion.")} - {"intact"}
+        title = f"{''.join(told)} Mean, and 95% interval from 5 values on".strip()
+        axes.set(xlabel=varied, ylabel=outcome, title=title)
         axes.grid(alpha=0.3)
         axes.legend(fontsize="small")
 

@@ -205,7 +205,7 @@ def episodes_csv(groups: Iterable[tuple[dict[str, Any], Mapping[str, Any]]]) -> 
       groups: what stands in all rows of a group, and its figures, name -> [N].
     """
     rows = [
-        about | {"episode": i} | {name: float(x[i]) for name, x in figures.items()}
+        about | {"episode": i} | {name: x[i].item() for name, x in figures.items()}
         for about, figures in groups
         for i in range(len(next(iter(figures.values()))))
     ]

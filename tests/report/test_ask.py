@@ -141,9 +141,10 @@ def test_a_greater_share_has_the_units_of_a_smaller_one():
 
 
 class Loaded:
-    """The cart-pole's sizes; a load that is drawn, and told, otherwise than was asked for."""
+    """The cart-pole's sizes; a load that is drawn, and told, otherwise than was asked for; clips."""
 
     action_size = 1
+    names = ("Light_1", "Heavy_1")
 
     def __init__(self, drawn):
         self.drawn = drawn
@@ -157,7 +158,8 @@ class Loaded:
 
     def state(self, load, seen):
         no, metrics = jnp.zeros((), bool), {"weight": load}
-        return State(seen, seen, 1.0 + seen[0], no, no, metrics, {"of": {"load": load}})
+        task = {"of": {"load": load}, "clip": (load > self.drawn + 0.05).astype(jnp.int32)}
+        return State(seen, seen, 1.0 + seen[0], no, no, metrics, task)
 
 
 @pytest.mark.parametrize("option", ["load", "weight"])
@@ -165,7 +167,7 @@ def test_the_value_that_each_episode_had_is_told_whatever_was_asked_for(pole, op
     setup, state = pole[0]._replace(env=Loaded(0.5)), pole[1]
     options = SimpleNamespace(episodes=4, outcome="weight", varied=f"env.{option}", seed=0)
     judge = asking.program(setup, state, options)
-    found = jax.device_get(judge(state, jax.random.key(3)))
+    found = asking.named(setup.env, jax.device_get(judge(state, jax.random.key(3))))
     had = found[f"env.{option}"]
     assert len(set(had.tolist())) == 4 and (had >= 0.5).all()
     np.testing.assert_allclose(found["weight"], had, rtol=1e-5)
@@ -175,6 +177,8 @@ def test_the_value_that_each_episode_had_is_told_whatever_was_asked_for(pole, op
     rows = list(csv.DictReader(comparison.episodes_csv(answers).decode().splitlines()))
     assert [float(row[options.varied]) for row in rows] == had.tolist()
     assert {row["value"] for row in rows} == {"0.3"}
+    assert [row["clip"] for row in rows] == ["Heavy_1" if x > 0.55 else "Light_1" for x in had]
+    assert len({row["clip"] for row in rows}) == 2
 
 
 def answer(run, value, values, lesion="intact"):
