@@ -141,7 +141,7 @@ def test_a_greater_share_has_the_units_of_a_smaller_one():
 
 
 class Loaded:
-    """The cart-pole's sizes; clips; a load that is drawn, and told, otherwise than was asked for."""
+    """The cart-pole's sizes; clips; a load that is drawn otherwise than was asked for."""
 
     action_size = 1
     names = ("Light_1", "Heavy_1")
