@@ -42,16 +42,19 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     'ppo.learning_rate'
     >>> nearest("reward_near", ["train/reward"])
     ''
+    >>> nearest("Turn_3", ["Turn_3.p", "Turn_4.p"])  # the beginning of one alone
+    'Turn_3.p'
     """
     last = {v: re.split(r"[./]", v)[-1] for v in valid}
     tail = re.split(r"[./]", name)[-1]
     for whole, part in last.items():
         if len(tail) > 1 and tail == "".join(word[:1] for word in re.split("[-_]", part)):
             return whole
-    near = difflib.get_close_matches(name, last, n=1, cutoff=0.65)
+    begun = [whole for whole in last if whole.startswith(f"{name}.")]
+    near = begun if len(begun) == 1 else difflib.get_close_matches(name, last, n=1, cutoff=0.65)
     # What only the beginning has in common, such as "ppo.", is no likeness.
-    alike = near and difflib.SequenceMatcher(None, tail, last[near[0]]).ratio() >= 0.6
-    return near[0] if alike else ""
+    alike = near == begun or near and difflib.SequenceMatcher(None, tail, last[near[0]]).ratio() >= 0.6
+    return near[0] if near and alike else ""
 
 
 def unknown_name(kind: str, name: str, valid: Iterable[str], where: str = "") -> str:
