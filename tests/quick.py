@@ -31,6 +31,7 @@ class Jit:
     """In place of `jax.jit`: it compiles quickly; inside of what is traced it is as it was."""
 
     def __init__(self, function: Callable, **options: Any) -> None:
+        self._made = function, options
         self._quick, self._inner = jit(function, **options), JAX_JIT(function, **options)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
@@ -39,6 +40,10 @@ class Jit:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._quick, name)
+
+    def __reduce__(self) -> tuple:  # a copy of an environment has a copy of it
+        function, options = self._made
+        return functools.partial(Jit, **options), (function,)
 
 
 def kept(compile_job: Callable) -> Callable:

@@ -16,6 +16,8 @@ gymnasium = pytest.importorskip("gymnasium")
 from purerl.adapters import gymnasium_envs  # noqa: E402
 from purerl.checks import examine_env  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly")
+
 
 class Counter(gymnasium.Env):
     """Adds what it is given to where it began; ends beyond 3, and is cut off after five steps."""

@@ -23,7 +23,7 @@ from purerl.envs import cartpole_swingup, run
 from tests.golden import privileged
 from tests.test_readme import PAGES, blocks
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("file_is_compiled_quickly")]
 
 ROOT = Path(__file__).parent.parent.parent
 

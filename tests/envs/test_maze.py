@@ -9,6 +9,8 @@ import pytest
 from purerl.envs import maze_forage, mazes, sight
 from purerl.envs.mazes import Maze
 
+pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly")
+
 NUMBER = 64
 
 

@@ -24,6 +24,8 @@ from purerl.runs.manifest import differences
 from tests.ppo.probes import Probe
 from tests.test_rooms import MODULES, own
 
+pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly")
+
 ROOT = Path(__file__).parent.parent.parent
 TOY = Path(__file__).parent.parent / "runs" / "toy_experiment.py"
 COMPUTING = ["adapters", "clips", "core", "devices", "exact", "eyes", "physics", "ppo"]  # rooms

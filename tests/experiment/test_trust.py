@@ -22,6 +22,8 @@ from tests.runs.test_foreign_files import (  # noqa: F401
     trained,
 )
 
+pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly")
+
 
 @pytest.fixture
 def home(tmp_path, monkeypatch) -> Path:

@@ -15,6 +15,8 @@ from purerl import compare, run
 from purerl.core.errors import FAILURE, USAGE
 from purerl.report import comparison, run_reader
 
+pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly")
+
 ROOT = Path(__file__).parent.parent.parent
 TOY = ROOT / "tests" / "runs" / "toy_experiment.py"
 PPO = {"num_steps": 400, "num_envs": 10, "rollout_length": 10, "num_minibatches": 1}

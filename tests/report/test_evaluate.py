@@ -14,6 +14,9 @@ from purerl import evaluate, run
 from purerl.core.errors import USAGE
 from purerl.runs import checkpoint_folder, loaded_run
 
+# Bits are compared within one process, and between two that compile as a run does.
+pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly")
+
 TOY = Path(__file__).parent.parent / "runs" / "toy_experiment.py"
 ROOT = TOY.parent.parent.parent
 

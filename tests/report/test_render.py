@@ -27,6 +27,8 @@ from purerl.runs.policy import Policy
 from purerl.runs.restored_run import restore
 from tests import quick
 
+pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly")
+
 TINY = "--ppo.num-envs 4 --ppo.rollout-length 8 --ppo.num-steps 96 --ppo.num-minibatches 2"
 TINY += " --ppo.episode-length 60 --evaluation.num-episodes 2 --evaluation.number 1"
 

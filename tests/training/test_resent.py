@@ -15,6 +15,8 @@ from purerl.runs import checkpoint_folder
 from purerl.training import loggers, session
 from tests.experiment.test_source_hashes import TOY
 
+pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly")
+
 WORDS = [str(TOY), "--evaluation.number", "6", "--checkpoints", "2", "--wandb", "offline"]
 
 
