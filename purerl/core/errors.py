@@ -51,10 +51,12 @@ def nearest(name: str, valid: Iterable[str]) -> str:
         if len(tail) > 1 and tail == "".join(word[:1] for word in re.split("[-_]", part)):
             return whole
     begun = [whole for whole in last if whole.startswith(f"{name}.")]
-    near = begun if len(begun) == 1 else difflib.get_close_matches(name, last, n=1, cutoff=0.65)
+    if len(begun) == 1:
+        return begun[0]
+    near = difflib.get_close_matches(name, last, n=1, cutoff=0.65)
     # What only the beginning has in common, such as "ppo.", is no likeness.
-    alike = near == begun or near and difflib.SequenceMatcher(None, tail, last[near[0]]).ratio() >= 0.6
-    return near[0] if near and alike else ""
+    alike = near and difflib.SequenceMatcher(None, tail, last[near[0]]).ratio() >= 0.6
+    return near[0] if alike else ""
 
 
 def unknown_name(kind: str, name: str, valid: Iterable[str], where: str = "") -> str:
