@@ -45,7 +45,8 @@ def text(tables: Tables, index: np.ndarray, number: str = "i") -> str:
     if line is not None:
         return _line(*line, number)
     digits = _digits(index, number, MOST_DIGITS) if len(index) >= LONG else None
-    return digits or f"T[{tables.place(index)}+{number}]"
+    least = int(index.min())  # maps of which one is the other and a constant share a table
+    return digits or f"T[{tables.place(index - least)}+{number}]" + (f"+{least}" if least else "")
 
 
 def as_line(index: np.ndarray) -> tuple[int, int] | None:

@@ -7,6 +7,7 @@ device, and in the C++ of one lane.
   lanes l and l + 16 are added, l and l + 8, and so on down to l + 1.
 - Any other row, from its first term to its last.
 - Terms that are known to be 0 may be left out of a row (`Builder._packed`): what is left is a row.
+  Where lanes share a row each leaves out its own (`terms_of`), and the sum is bit for bit the same.
 """
 
 import math
@@ -19,6 +20,9 @@ from purerl.exact.kernel.values import Fold, Map, Value, View
 LANES = 32  # of a warp, which computes one environment
 FEW_ROWS = 16  # of a fold whose rows the lanes share; of more rows each has a lane
 WIDEST = 32  # a square of sums, such as a Hessian, is shared too, if it has no more columns
+# A row has the terms of a longer one, to read the same numbers, if it needs more than this share of
+# the longer one's rounds.
+SHORTEST = 0.6
 
 
 def are_shared(fold: Fold) -> bool:
@@ -40,6 +44,45 @@ def width_of(fold: Fold, widest: int = WIDEST) -> int:
     _, number = np.unique(ids, return_inverse=True)
     factor = (number.reshape(ids.shape) * (1 << 32) + index).reshape(n, n, fold.terms, -1)
     return n if (np.sort(factor) == np.sort(factor.swapaxes(0, 1))).all() else 0
+
+
+def terms_of(zero: np.ndarray) -> list[np.ndarray]:
+    """Returns which terms are added in each of the rows that lanes share: none in one of zeros.
+
+    These are terms that follow each other, or entry i is one of lane i % 32's: it adds terms k with
+    k % 32 = i % 32, as of a whole row, and then ones that are known to be 0.
+
+    Args:
+      zero: whether each term is known to be 0, [rows, terms].
+    """
+    found = [np.zeros(0, int)] * len(zero)
+    alike: list[np.ndarray] = []  # which terms rows have in common, the shortest first
+    for row in np.argsort(zero.sum(1), kind="stable"):
+        needed = ~zero[row]
+        enough = (some for some in alike if not (needed & ~some).any())
+        best = next((x for x in enough if _rounds(needed) > SHORTEST * _rounds(x)), needed)
+        if needed.any():
+            found[row] = _by_lanes(best)
+        if best is needed:
+            alike.insert(0, needed)
+    return found
+
+
+def _rounds(needed: np.ndarray) -> int:
+    """Returns how many terms the busiest lane adds."""
+    return int(np.bincount(np.flatnonzero(needed) % LANES, minlength=1).max())
+
+
+def _by_lanes(needed: np.ndarray) -> np.ndarray:
+    places, rounds = np.flatnonzero(needed), _rounds(needed)
+    line = np.arange(places[0], places[-1] + 1)
+    if len(line) <= rounds * LANES:
+        return line
+    found = np.full((LANES, rounds), needed.argmin())
+    for lane, row in enumerate(found):
+        own = places[places % LANES == lane]
+        row[: len(own)] = own
+    return found.T.reshape(-1)
 
 
 def _factors(value: Value, places: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:

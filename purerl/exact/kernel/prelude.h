@@ -27,7 +27,8 @@
 #define WARP(lanes)
 #define ONE(turn) if (IS(turn))
 #define IS(turn) (WARPS == 1 || thread / 32 == (turn) % WARPS)
-#define LANES(i, n) _Pragma("unroll 1") for (int i = lane; i < (n); i += 32)
+#define LANES(i, first, end) \
+  _Pragma("unroll 1") for (int i = (first) + ((lane - (first)) & 31); i < (end); i += 32)
 #define ROUNDS(j, n) _Pragma("unroll 1") for (int j = 0; j < (n); ++j)
 #define REPEAT(j, n) for (int j = 0, end = unknown(n); j < end; ++j)  // too long to be unrolled
 #define SYNC together()
@@ -93,7 +94,7 @@ FUNCTION int uniform(int x) {
 #define FEW EACH
 #define WARP(lanes) ROUNDS(lane, lanes)
 #define ONE(turn)
-#define LANES ROUNDS
+#define LANES(i, first, end) for (int i = (first); i < (end); ++i)
 #define ROUNDS(j, n) for (int j = 0; j < (n); ++j)
 #define REPEAT ROUNDS
 #define SYNC

@@ -29,6 +29,7 @@ class Scheduler:
         """Decides what is kept, and plans all blocks."""
         # Single constants that stand in memory, each by its bits.
         self.slots: dict[int, int] = {}
+        self.zeros = program.zeros
         self.keep = {
             x: _Row(Held(places.shape, x.kind, x.block), places, _ranks(places, x.size))
             for x, places in keeping.kept(program.block, program.outputs, program.zeros).items()
@@ -77,9 +78,11 @@ class Scheduler:
     def _statement(self, item: Map | Fold) -> Statement:
         row = self.keep[item]
         if isinstance(item, Fold):
-            code = self.code(item.arg, item.arg.places.reshape(-1, item.terms)[row.places])
+            terms = item.arg.places.reshape(-1, item.terms)[row.places]
             width = item.width if len(row.places) == item.size else 0
-            return Statement([row.home], code, item.op, item.terms, item.shared, width)
+            zero = self.zeros.of(item.arg)[terms] & (item.op == "add")
+            code = self.code(item.arg, terms)
+            return Statement([row.home], code, item.op, item.terms, item.shared, width, zero)
         code = Code()
         code.result = _Expression(self, code).compute(item, row.places)
         return Statement([row.home], code)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from purerl.exact.kernel import memory, operations, side_by_side
+from purerl.exact.kernel import lanes, memory, operations, side_by_side
 from purerl.exact.kernel.cells import TYPES, Cells
 from purerl.exact.kernel.lanes import LANES
 from purerl.exact.kernel.reading import Program
@@ -57,6 +57,20 @@ def written(program: Program) -> Text:
 
 def _numbers(arrays: Sequence[np.ndarray], suffix: str = "") -> str:
     return ",".join(f"{x}{suffix}" for array in arrays for x in array) or "0"
+
+
+class _Row(NamedTuple):
+    """A sum that lanes share: one number of a statement, and which terms are added."""
+
+    statement: Statement
+    number: int
+    terms: np.ndarray  # see `lanes.terms_of`
+
+    def place(self) -> tuple[int, int]:
+        """Returns where the loop over its terms begins and ends."""
+        line = len(self.terms) and (np.diff(self.terms) == 1).all()
+        first = int(self.terms[0]) if line else 0
+        return first, first + len(self.terms)
 
 
 class _Writer(Cells):
@@ -155,44 +169,53 @@ class _Writer(Cells):
 
     def _shared(self, statements: list[Statement]) -> Iterator[str]:
         """The lanes share each row. Rows of equal length are in one loop, and read once."""
-        fold, terms, kind = _shape(statements[0])
-        rows = [(x, row) for x in statements for row in _distinct_rows(x)]
+        fold, _, kind = _shape(statements[0])
+        rows = [row for x in statements for row in _distinct_rows(x)]
+        rows.sort(key=_Row.place)
         for start in range(0, len(rows), AT_ONCE):
             some = rows[start : start + AT_ONCE]
-            body: dict[str, str] = {}  # C -> its name
-            sums = []
-            for number, (statement, row) in enumerate(some):
-                result = self._row(statement.code, row, body)
-                text = operations.text_of(fold, kind, None, f"SUM({number})", result)
-                sums.append(f"SUM({number}) = {text};")
-            lines = [f"auto {name} = {text};" for text, name in body.items()]
             count, neutral = _padded(len(some)), operations.neutral(fold, kind)
             yield f"{self.one()} {{ SUMS({TYPES[kind]}, {count}, {neutral})"
-            yield f"LANES(i, {terms}) {{ {' '.join(lines + sums)} }}"
+            numbered = enumerate(some)
+            for (first, end), alike in itertools.groupby(numbered, lambda x: x[1].place()):
+                if end > first:  # else all of its terms are 0
+                    yield f"LANES(i, {first}, {end}) {{ {self._sums(fold, kind, alike)} }}"
             to, also = (self.tables.place(x) for x in self._targets(some))
             memory = "P" if kind == "f" else "I"
             yield f"PUT(joined_by_{fold}, {count}, {len(some)}, {memory}, T+{to}, T+{also}) }}"
 
-    def _row(self, code: Code, row: int, known: dict[str, str]) -> str:
+    def _sums(self, fold: str, kind: str, rows: Iterator[tuple[int, _Row]]) -> str:
+        """Returns C that adds a term to each of some rows, by the number of its sum."""
+        body: dict[str, str] = {}  # C -> its name
+        sums = []
+        for number, row in rows:
+            result = self._row(row, body)
+            text = operations.text_of(fold, kind, None, f"SUM({number})", result)
+            sums.append(f"SUM({number}) = {text};")
+        return " ".join([*(f"auto {name} = {text};" for text, name in body.items()), *sums])
+
+    def _row(self, row: _Row, known: dict[str, str]) -> str:
         """Adds the lines for a term of one row to those known; returns the name of the term."""
 
         def name(text: str) -> str:
             return known.setdefault(text, f"v{len(known)}")
 
-        leaves = [x._replace(which=x.which[row], at=x.at[row]) for x in code.leaves]
-        names = [name(self.leaf(leaf)) for leaf in leaves]
+        code, at = row.statement.code, (row.number, row.terms)
+        leaves = [x._replace(which=x.which[at], at=x.at[at]) for x in code.leaves]
+        i = f"(i-{row.place()[0]})" if row.place()[0] else "i"
+        names = [name(self.leaf(leaf, i)) for leaf in leaves]
         results: list[str] = []
         for line in code.lines:
             args = [names[~arg] if arg < 0 else results[arg] for arg in line.args]
             results.append(name(self.operation(code, line, args)))
         return names[~code.result] if code.result < 0 else results[code.result]
 
-    def _targets(self, rows: Sequence[tuple[Statement, int]]) -> tuple[np.ndarray, np.ndarray]:
+    def _targets(self, rows: Sequence[_Row]) -> tuple[np.ndarray, np.ndarray]:
         """Returns where each row's result is put, and where a second time: see `_distinct_rows`."""
-        first = [self.address[statement.writes[0]] for statement, _ in rows]
-        to = np.array([row for _, row in rows])
-        also = [_mirrored(statement, row) for statement, row in rows]
-        return np.array(first) + to, np.array(first) + np.array(also)
+        first = np.array([self.address[row.statement.writes[0]] for row in rows])
+        to = [row.number for row in rows]
+        also = [_mirrored(row.statement, row.number) for row in rows]
+        return first + np.array(to), first + np.array(also)
 
     # --- steps ---
 
@@ -251,10 +274,13 @@ def _shape(statement: Statement) -> tuple[str, int, str]:
     return statement.fold, statement.terms, statement.writes[0].kind
 
 
-def _distinct_rows(statement: Statement) -> list[int]:
+def _distinct_rows(statement: Statement) -> list[_Row]:
     """Returns the rows to sum: of a symmetric square those of its lower half."""
     n = statement.width
-    return [r * n + c for r in range(n) for c in range(r + 1)] or list(range(statement.size))
+    rows = [r * n + c for r in range(n) for c in range(r + 1)] or list(range(statement.size))
+    assert statement.zero is not None
+    terms = lanes.terms_of(statement.zero[rows])
+    return [_Row(statement, *row) for row in zip(rows, terms, strict=True)]
 
 
 def _mirrored(statement: Statement, row: int) -> int:

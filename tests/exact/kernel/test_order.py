@@ -1,6 +1,7 @@
 """The order of every sum, which is the model's alone: known by its bits."""
 
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -95,6 +96,47 @@ def test_a_hessian_has_no_terms_that_are_known_to_be_zero_and_one_half(tmp_path)
     terms = sum(x.arg.size for x in folds_of(square, ROWS, d))
     both = (MOVED[:, :, None] & MOVED[:, None, :]).sum()
     assert both / 2 < terms < 0.9 * both, "each term once, and not above the diagonal"
+
+
+# Of 20 columns three are of all rows; six are of every other, or of the last 60 alone; one of none.
+SOME = np.ones((150, 20), bool)
+SOME[1::2, 3:9], SOME[:90, 9:15], SOME[:, 19] = False, False, False
+SOME[:, 15:19] = np.random.default_rng(3).random((150, 4)) < 0.2
+
+
+@needs_compiler
+def test_lanes_leave_out_known_zeros_and_have_the_bits_of_the_whole_sums(tmp_path):
+    j = np.where(SOME, ROWS[:, :20], 0)
+    known = lambda j, d: ((j * SOME).T @ (d[:, None] * (j * SOME)), (j * SOME)[:, 2:].sum(0))  # noqa: E731
+    whole = lambda j, d: (j.T @ (d[:, None] * j), j[:, 2:].sum(0))  # noqa: E731
+    given = j.reshape(1, -1), np.linspace(0.5, 2, 150, dtype=np.float32)[None]
+    texts = [exact.compile_kernel(f, j, given[1][0]).text for f in (known, whole)]
+    found, wanted = (by_one_lane(text, *given) for text in texts)
+    warps = by_warps(texts[0], *given, folder=tmp_path, environments=1, warps=2)
+    for one, other, third in zip(found, wanted, warps, strict=True):
+        assert (one == other).all() and (one.view(np.int32) == third.view(np.int32)).all()
+    rounds = [rounds_of(text.body) for text in texts]
+    assert rounds[0] < 0.6 * rounds[1], rounds
+
+
+def rounds_of(body):
+    """Returns how many terms the busiest lane adds to sums, in all."""
+    loops = re.findall(r"LANES\(i, (\d+), (\d+)\) (.*)", body)
+    return sum(-(-(int(end) - int(first)) // 32) * text.count("SUM(") // 2
+               for first, end, text in loops)  # fmt: skip
+
+
+@pytest.mark.parametrize("share", [0, 0.02, 0.3, 0.9, 1])
+def test_each_lane_adds_its_own_terms_in_their_order(share):
+    needed = np.random.default_rng(2).random((40, 150)) < share
+    needed[:8, 100:] = needed[:8, :40] = False
+    for row, terms in zip(needed, lanes.terms_of(~needed), strict=True):
+        line = len(terms) and (np.diff(terms) == 1).all()
+        lane = (terms if line else np.arange(len(terms))) % 32
+        for number in range(32):
+            own = [term for term in terms[lane == number] if row[term]]
+            assert own == [*np.flatnonzero(row[number::32]) * 32 + number]
+        assert -(-len(terms) // 32) <= max(0, *(np.ceil(row[i::32].sum() / 0.6) for i in range(32)))
 
 
 def test_known_zeros_are_zeros_and_all_that_are_to_be_found():
