@@ -131,6 +131,23 @@ def read_by(copies: Sequence[tuple[Value, Code]]) -> set[Value]:
     return set().union(*(code.reads() for _, code in copies))
 
 
+def needed_at_last(plan: Plan) -> list[Any]:
+    """Returns what a loop's last round alone has to do: statements, and copies to a carry.
+
+    No statement of a next round reads what comes of them.
+    """
+    every = [x for level in plan.levels for x in level]
+    read = read_by(plan.copies).union(*(x.reads() for x in every))
+    found: list[Any] = [copy for copy in plan.copies if copy[0] not in read]
+    needed = read_by([copy for copy in plan.copies if copy[0] in read])
+    for statement in reversed(every):
+        if needed & {home(x) for x in statement.writes}:
+            needed |= statement.reads()
+        else:
+            found.append(statement)
+    return found
+
+
 def merged(level: Sequence[Any]) -> list[Any]:
     """Returns a level's statements with small ones that compute alike made one."""
     groups: dict[Any, list[Any]] = collections.defaultdict(list)

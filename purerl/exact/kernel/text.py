@@ -11,7 +11,7 @@ from purerl.exact.kernel.cells import TYPES, Cells
 from purerl.exact.kernel.lanes import LANES
 from purerl.exact.kernel.reading import Program
 from purerl.exact.kernel.schedule import Scheduler
-from purerl.exact.kernel.statements import Code, Plan, Statement, StepStatement
+from purerl.exact.kernel.statements import Code, Plan, Statement, StepStatement, needed_at_last
 from purerl.exact.kernel.values import Choice, Linear, Loop, NoRuleError, Value, home
 
 # What follows is of the fastest build on an H200 (lab/2026-11-29-one-kernel-on-a-cpu.md).
@@ -105,26 +105,37 @@ class _Writer(Cells):
 
     # --- statements ---
 
-    def _plan(self, plan: Plan, copied: bool = True) -> Iterator[str]:
+    def _plan(self, plan: Plan, copied: bool = True, last: str = "") -> Iterator[str]:
+        """Writes a block; `last` is C for whether it is the last round of a loop."""
+        late = set(map(id, needed_at_last(plan))) if last else set()
         for number, level in enumerate(plan.levels):
             self.turn = 0
             if plan.in_step and number % LOCKSTEP == 0:
                 yield "LOCKSTEP;"
-            plain = [x for x in level if isinstance(x, Statement)]
-            shared = sorted((x for x in plain if x.shared), key=_shape)
-            for _, some in itertools.groupby(shared, _shape):
-                yield from self._shared(list(some))
-            others = [x for x in plain if not x.shared]
-            yield from map(self._fold, (x for x in others if x.terms > FEW_TERMS))
-            yield from self._jobs([self._job(x) for x in others if x.terms <= FEW_TERMS])
-            for step in level:
-                if isinstance(step, StepStatement):
-                    yield from self._step(step)
+            yield from self._level([x for x in level if id(x) not in late])
+            if waits := [x for x in level if id(x) in late]:
+                yield from (f"if ({last}) {{", *self._level(waits), "}")
             yield "SYNC;"
             self.statements += len(level)
         if copied and plan.copies:
-            yield from self._jobs([self.job(value, code) for value, code in plan.copies])
+            for some, begin, end in ((False, "", ""), (True, f"if ({last}) {{", "}")):
+                copies = [x for x in plan.copies if (id(x) in late) is some]
+                if copies:
+                    jobs = [self.job(value, code) for value, code in copies]
+                    yield from (begin, *self._jobs(jobs), end)
             yield "SYNC;"
+
+    def _level(self, level: Sequence[Statement | StepStatement]) -> Iterator[str]:
+        plain = [x for x in level if isinstance(x, Statement)]
+        shared = sorted((x for x in plain if x.shared), key=_shape)
+        for _, some in itertools.groupby(shared, _shape):
+            yield from self._shared(list(some))
+        others = [x for x in plain if not x.shared]
+        yield from map(self._fold, (x for x in others if x.terms > FEW_TERMS))
+        yield from self._jobs([self._job(x) for x in others if x.terms <= FEW_TERMS])
+        for step in level:
+            if isinstance(step, StepStatement):
+                yield from self._step(step)
 
     def _jobs(self, jobs: Sequence[side_by_side.Job]) -> Iterator[str]:
         """Writes what is independent: see `side_by_side`."""
@@ -233,13 +244,15 @@ class _Writer(Cells):
 
     def _loop(self, step: Loop, plans: Sequence[Plan]) -> Iterator[str]:
         if step.rounds is not None:
+            last = f"round{step.inner.depth} == {step.rounds - 1}"
             yield f"REPEAT(round{step.inner.depth}, {step.rounds}) {{"
         else:
+            last = ""
             yield "for (;;) {"
             yield from self._plan(plans[0])
             assert plans[0].test
             yield f"{self._uniform(plans[0].test)} if (!which) break;"
-        yield from self._plan(plans[-1])
+        yield from self._plan(plans[-1], last=last)
         yield "}"
 
     def _choice(self, statement: StepStatement) -> Iterator[str]:

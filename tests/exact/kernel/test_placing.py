@@ -231,3 +231,30 @@ def test_all_warps_of_a_block_wait_only_where_all_make_the_same_rounds():
     begin, end = text.index("for (;;)"), text.rindex("REPEAT(")
     assert "LOCKSTEP" not in text[begin:end].rsplit("}", 1)[0]
     assert "LOCKSTEP" in text[:begin] and "LOCKSTEP" in text[end:]
+
+
+def rounds(read):
+    """Five rounds that carry what no later round reads, and a number that is read only if asked."""
+
+    def body(c, _):
+        y, seen, number = c
+        y = 0.9 * jnp.sin(y) + (0.1 * seen.sum() if read else 0.0)
+        small = lax.while_loop(lambda z: z.sum() > 1.0, lambda z: 0.5 * z, jnp.exp(y))
+        return (y, jnp.cos(small) + small[::-1], number + 1), None
+
+    return lambda x: lax.scan(body, (x, jnp.zeros(9), jnp.int32(0)), None, 5)[0]
+
+
+@needs_compiler
+@pytest.mark.parametrize("read", [False, True])
+def test_what_no_later_round_reads_is_computed_in_the_last_one_alone(read, tmp_path):
+    kernel = exact.compile_kernel(rounds(read), X)
+    before, _, last = kernel.text.body.partition("if (round1 == 4) {")
+    assert ("expf" in before) == read and ("expf" in last) != read and "sinf" in before
+    one = by_one_lane(kernel.text, X[None])
+    wanted = jax.tree.leaves(jax.jit(rounds(read))(X))
+    assert all(np.allclose(a, np.ravel(b), 1e-5, 1e-6) for a, b in zip(one, wanted, strict=True))
+    warps = by_warps(kernel.text, X[None], folder=tmp_path, environments=1, warps=3)
+    assert all(
+        (a.view(np.int32) == b.view(np.int32)).all() for a, b in zip(one, warps, strict=True)
+    )
