@@ -118,11 +118,9 @@ class _Writer(Cells):
             yield "SYNC;"
             self.statements += len(level)
         if copied and plan.copies:
-            for some, begin, end in ((False, "", ""), (True, f"if ({last}) {{", "}")):
-                copies = [x for x in plan.copies if (id(x) in late) is some]
-                if copies:
-                    jobs = [self.job(value, code) for value, code in copies]
-                    yield from (begin, *self._jobs(jobs), end)
+            yield from self._jobs([self.job(*x) for x in plan.copies if id(x) not in late])
+            if then := [self.job(*x) for x in plan.copies if id(x) in late]:
+                yield from (f"if ({last}) {{", *self._jobs(then), "}")
             yield "SYNC;"
 
     def _level(self, level: Sequence[Statement | StepStatement]) -> Iterator[str]:
