@@ -24,8 +24,8 @@ _IN_IMPL += ("subtree_angmom", "cacc", "cfrc_int", "cfrc_ext")
 # where MJX has the last; forces and accelerations are the last stage's.
 _OF_SENSORS = ("sensordata", "cacc", "cfrc_int", "cfrc_ext")
 # On a GPU a control step is one kernel if the Jacobian of its constraints has no more numbers. That
-# of a humanoid has 8,181. A rodent's kernel is 1.4 times as fast as XLA's and takes two minutes to
-# make, where `warp` is 4 times as fast (lab/2026-11-29-one-kernel-on-a-gpu.md).
+# of a humanoid has 8,181. A rodent's kernel is 1.5 times as fast as XLA's and takes two minutes to
+# make, where `warp` is 3 to 4 times as fast as that (lab/2026-11-29-half-the-memory.md).
 MOST_OF_A_KERNEL = 10_000
 TRIED, TRIED_FOR = 64, 12  # simulations and control steps on which a kernel is compared with XLA
 

@@ -32,6 +32,7 @@ Case = tuple[Any, Experiment, Lesion]  # a condition: the value of what varies, 
 # figure -> [N], under the option's own name what each had of what varies, if the environment tells.
 Answer = tuple[dict[str, Any], dict[str, np.ndarray]]
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+CLIP = "task/clip"  # among figures, until `named` has put the clip's name there: no metric's name
 COLUMNS = ("run", "lesion", "value", "n", "mean", "interval")
 
 
@@ -132,7 +133,7 @@ def program(setup: Setup, state: TrainState, options: Any) -> Callable[..., Any]
     """Returns a program of (state, key) -> the figures of an `Answer`.
 
     What an episode has of the option that varies is a metric, or a number of `task`, of its name.
-    Of imitation there is `clip`, the number of the clip that it follows.
+    Of imitation there is CLIP, the number of the clip that it follows.
     """
     config, env, network, _ = setup
     sizes = {"num_episodes": options.episodes, "episode_length": config.episode_length}
@@ -142,21 +143,22 @@ def program(setup: Setup, state: TrainState, options: Any) -> Callable[..., Any]
         begun = evaluation.start(env, state, reset_key, **sizes).env_state
         option = options.varied.partition("env.")[2].split(".")[-1]
         told = begun.task, begun.metrics
-        paths = zip(leaf_paths(told), jax.tree.leaves(told), strict=True)
-        had = {path.split("/")[-1]: x for path, x in paths if x.ndim == 1}
+        leaves = dict(zip(leaf_paths(told), jax.tree.leaves(told), strict=True))
+        had = {path.split("/")[-1]: x for path, x in leaves.items() if x.ndim == 1}
         own = {options.varied: had[option]} if option in had else {}
-        own |= {"clip": had["clip"]} if "clip" in had and hasattr(env, "names") else {}
+        own |= {CLIP: leaves["0/clip"]} if "0/clip" in leaves and hasattr(env, "names") else {}
         return own | evaluation.evaluate_policy(env, network, state, key, **sizes)
 
-    if options.outcome not in (names := jax.eval_shape(judge, state, jax.random.key(0))):
+    names = jax.eval_shape(judge, state, jax.random.key(0)).keys() - {CLIP}
+    if options.outcome not in names:
         raise UserError(unknown_name("outcome", options.outcome, sorted(names)))
     return jax.jit(judge)
 
 
 def named(env: Any, figures: dict[str, Any]) -> dict[str, Any]:
-    """Returns the figures with each clip's name in the place of its number."""
-    clips = {name: np.array(env.names)[x] for name, x in figures.items() if name == "clip"}
-    return figures | clips
+    """Returns the figures with each clip's name, `clip`, in the place of its number."""
+    rest = {name: x for name, x in figures.items() if name != CLIP}
+    return rest | ({"clip": np.array(env.names)[figures[CLIP]]} if CLIP in figures else {})
 
 
 def summarize(answers: Sequence[Answer], outcome: str) -> list[dict[str, Any]]:

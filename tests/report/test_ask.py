@@ -157,7 +157,7 @@ class Loaded:
         return self.state(state.task["of"]["load"], state.observation + 0.1 * action)
 
     def state(self, load, seen):
-        no, metrics = jnp.zeros((), bool), {"weight": load}
+        no, metrics = jnp.zeros((), bool), {"weight": load, "clip": seen[0]}  # of any name
         task = {"of": {"load": load}, "clip": (load > self.drawn + 0.05).astype(jnp.int32)}
         return State(seen, seen, 1.0 + seen[0], no, no, metrics, task)
 
@@ -179,6 +179,8 @@ def test_the_value_that_each_episode_had_is_told_whatever_was_asked_for(pole, op
     assert {row["value"] for row in rows} == {"0.3"}
     assert [row["clip"] for row in rows] == ["Heavy_1" if x > 0.55 else "Light_1" for x in had]
     assert len({row["clip"] for row in rows}) == 2
+    with pytest.raises(UserError, match="no outcome 'task/clip'"):
+        asking.program(setup, state, SimpleNamespace(**vars(options) | {"outcome": asking.CLIP}))
 
 
 def answer(run, value, values, lesion="intact"):

@@ -61,8 +61,7 @@ def _tried(f: Callable, reached: Callable, example: tuple) -> tuple[compiling.Ke
         by_xla = functools.cache(functools.partial(threads.submit, reached, *example))
         try:
             kernel = compiling.compile_kernel(f, *example, meanwhile=by_xla)
-            on_gpu = jax.default_backend() == "gpu"
-            by = f"NVRTC {compilers.nvrtc_version()}" if on_gpu else "g++"
+            by = f"NVRTC {compilers.nvrtc_version()}" if jax.default_backend() == "gpu" else "g++"
             block = compilers.block_of(kernel.text, launch.capability())
             if (fit := block.environments) < FEWEST:
                 said = f"a block of this GPU has room for {fit} environments, of {FEWEST}"

@@ -185,8 +185,7 @@ class _Writer(Cells):
             some = rows[start : start + AT_ONCE]
             count, neutral = _padded(len(some)), operations.neutral(fold, kind)
             yield f"{self.one()} {{ SUMS({TYPES[kind]}, {count}, {neutral})"
-            numbered = enumerate(some)
-            for (first, end), alike in itertools.groupby(numbered, lambda x: x[1].place()):
+            for (first, end), alike in itertools.groupby(enumerate(some), lambda x: x[1].place()):
                 if end > first:  # else all of its terms are 0
                     yield f"LANES(i, {first}, {end}) {{ {self._sums(fold, kind, alike)} }}"
             to, also = (self.tables.place(x) for x in self._targets(some))
