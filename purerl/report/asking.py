@@ -194,7 +194,7 @@ def draw(path: Path, rows: Sequence[dict[str, Any]], varied: str, outcome: str) 
             label = printable(f"{run} {lesion}")
             axes.errorbar(x, y, abs(ends - y), label=label, capsize=3, **style)
         told = {row["lesion"] for row in rows if varied.startswith("lesion.")} - {"intact"}
-        title = f"{''.join(told)} Mean, and 95% interval from 5 values on".strip()
+        title = "\n".join([*map(printable, told), "Mean, and 95% interval from 5 values on"])
         axes.set(xlabel=varied, ylabel=outcome, title=title)
         axes.grid(alpha=0.3)
         axes.legend(fontsize="small")
