@@ -59,11 +59,30 @@ def _read(name: str, part: Part, abstract: PyTree) -> tuple[Leaves, dict[str, An
         there = [key.removeprefix("params/") for key in stored if key.startswith("params/")]
         if not any(belongs(key, name) for key in there):
             raise UserError(unknown_name("part", name, top_names(there), f" in {run.path}"))
-        leaves, meta = checkpoint.load_leaves(path, abstract, owners, asked)
+        array = "normalizer/mean/value" in stored  # where this run may have a dict
+        like = abstract.replace(normalizer=_of_array(abstract.normalizer)) if array else abstract
+        leaves, meta = checkpoint.load_leaves(path, like, owners, asked)
     except checkpoint_folder.DamagedError as error:
         raise UserError(f"The checkpoint {path} is damaged: {error}.") from error
     facts = {"run": run.manifest["run_id"], "update": meta["update"]}
-    return leaves, facts | {"sha256": digest_leaves(leaves)}
+    facts |= {"sha256": digest_leaves(leaves)}
+    if like.normalizer is not abstract.normalizer:
+        leaves = Leaves({_of_entry(key): x for key, x in leaves.items()})
+    return leaves, facts
+
+
+def _of_array(normalizer: Any) -> Any:
+    """Returns the statistics of the entry "policy" alone, as those of an array are laid out."""
+    if not isinstance(normalizer.mean, dict) or "policy" not in normalizer.mean:
+        return normalizer
+    mean, variance = normalizer.mean["policy"], normalizer.variance["policy"]
+    return normalizer.replace(mean=mean, variance=variance)
+
+
+def _of_entry(key: str) -> str:
+    """Returns where what an array's statistics have at `key` is in a dict's."""
+    field, _, inner = key.partition("/")
+    return f"{field}/{inner.replace('/', '/policy/')}" if field == "normalizer" else key
 
 
 def put_in(state: PyTree, leaves: Leaves) -> PyTree:

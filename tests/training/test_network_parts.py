@@ -188,6 +188,23 @@ def test_one_entry_has_the_units_of_one_run(old):
         taken_parts.read_parts(both, abstract)
 
 
+def test_an_arrays_units_become_those_of_the_entry_policy(old):
+    """A teacher that was told all is read by a run whose observation is a dict."""
+    abstract = abstract_state(*objects.build(coded_experiment.experiment)[:3])
+    mean, variance = abstract.normalizer.mean, abstract.normalizer.variance
+    both = abstract.normalizer.replace(
+        mean={"more": mean, "policy": mean}, variance={"more": variance, "policy": variance}
+    )
+    part = {"decoder": Part(run=str(old), reads=("policy",))}
+    leaves, _ = taken_parts.read_parts(part, abstract.replace(normalizer=both))
+    taken = {key: x for key, x in leaves.items() if key.startswith("normalizer/")}
+    assert sorted(taken) == [
+        f"normalizer/{of}/policy/{x}" for of in ("mean", "variance") for x in ("error", "value")
+    ]
+    for key, x in taken.items():
+        assert (x == saved(old)[key.replace("/policy", "")]).all(), key
+
+
 def test_a_rate_of_its_own_is_of_its_parameters_alone():
     one = objects.build(replace(coded_experiment.experiment, parts={"decoder": Part(rate=0.25)}))
     params = jax.eval_shape(one.network.init, jax.random.key(0))[0]
