@@ -32,7 +32,8 @@ class Part:
     """Of that run: latest, best (highest evaluation return), or an update's number."""
     reads: tuple[str, ...] | None = None
     """Entries of the observation that it reads ("policy" where that is an array): their mean and
-    deviation are taken from that run too, and stay as they are."""
+    deviation are taken from that run too, and stay as they are. Where that run's observation is an
+    array and this one's a dict, the array is cut into these entries, in this order."""
 
     def __post_init__(self) -> None:
         """Raises ValueError for a rate that is none, and for units that nobody has chosen."""

@@ -6,7 +6,7 @@ May import: core, ppo, physics. Read: `eye.py`, `eyes.py`, `casting.py`; then `n
 
 from purerl.eyes.eye import Eye, of_camera, pair, rotation
 from purerl.eyes.eyes import Eyes
-from purerl.eyes.networks import Encoder, MlpOptions, RecurrentOptions, mlp, recurrent
+from purerl.eyes.networks import Convolutions, Encoder, MlpOptions, RecurrentOptions, mlp, recurrent
 
-__all__ = ["Encoder", "Eye", "Eyes", "MlpOptions", "RecurrentOptions", "mlp", "of_camera"]
-__all__ += ["pair", "recurrent", "rotation"]
+__all__ = ["Convolutions", "Encoder", "Eye", "Eyes", "MlpOptions", "RecurrentOptions", "mlp"]
+__all__ += ["of_camera", "pair", "recurrent", "rotation"]

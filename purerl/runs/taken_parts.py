@@ -3,10 +3,11 @@
 No code of that run is executed: its checkpoint says which arrays it has, of which shapes.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -59,30 +60,40 @@ def _read(name: str, part: Part, abstract: PyTree) -> tuple[Leaves, dict[str, An
         there = [key.removeprefix("params/") for key in stored if key.startswith("params/")]
         if not any(belongs(key, name) for key in there):
             raise UserError(unknown_name("part", name, top_names(there), f" in {run.path}"))
-        array = "normalizer/mean/value" in stored  # where this run may have a dict
-        like = abstract.replace(normalizer=_of_array(abstract.normalizer)) if array else abstract
+        array = "normalizer/mean/value" in stored and isinstance(abstract.normalizer.mean, dict)
+        like = _joined(abstract, part.reads or ()) if array else abstract
         leaves, meta = checkpoint.load_leaves(path, like, owners, asked)
     except checkpoint_folder.DamagedError as error:
         raise UserError(f"The checkpoint {path} is damaged: {error}.") from error
     facts = {"run": run.manifest["run_id"], "update": meta["update"]}
     facts |= {"sha256": digest_leaves(leaves)}
-    if like.normalizer is not abstract.normalizer:
-        leaves = Leaves({_of_entry(key): x for key, x in leaves.items()})
-    return leaves, facts
+    return (_cut(leaves, abstract, part.reads or ()) if array else leaves), facts
 
 
-def _of_array(normalizer: Any) -> Any:
-    """Returns the statistics of the entry "policy" alone, as those of an array are laid out."""
-    if not isinstance(normalizer.mean, dict) or "policy" not in normalizer.mean:
-        return normalizer
-    mean, variance = normalizer.mean["policy"], normalizer.variance["policy"]
-    return normalizer.replace(mean=mean, variance=variance)
+def _joined(abstract: PyTree, reads: Iterable[str]) -> PyTree:
+    """Returns the shapes of a state whose observation is an array: those entries, joined."""
+
+    def join(entries: dict[str, Any]) -> PyTree:
+        named = [entries[name] for name in reads if entries.get(name) is not None]
+        return jax.tree.map(lambda *x: jnp.concatenate(x), *named) if named else entries
+
+    of = abstract.normalizer
+    joined = [jax.eval_shape(join, of.mean), jax.eval_shape(join, of.variance)]
+    return abstract.replace(normalizer=of.replace(mean=joined[0], variance=joined[1]))
 
 
-def _of_entry(key: str) -> str:
-    """Returns where what an array's statistics have at `key` is in a dict's."""
-    field, _, inner = key.partition("/")
-    return f"{field}/{inner.replace('/', '/policy/')}" if field == "normalizer" else key
+def _cut(leaves: Leaves, abstract: PyTree, reads: Iterable[str]) -> Leaves:
+    """Returns an array's statistics as those of the entries that were joined to it."""
+    entries = abstract.normalizer.mean
+    names = [name for name in reads if entries.get(name) is not None]
+    ends = np.cumsum([entries[name].value.size for name in names])[:-1]
+    found = Leaves()
+    for key, x in leaves.items():
+        field, _, inner = key.partition("/")
+        of, _, which = inner.partition("/")
+        pieces = zip(names, np.split(x, ends), strict=True) if field == "normalizer" else ()
+        found |= {f"{field}/{of}/{name}/{which}": piece for name, piece in pieces} or {key: x}
+    return found
 
 
 def put_in(state: PyTree, leaves: Leaves) -> PyTree:

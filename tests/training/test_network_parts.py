@@ -5,8 +5,10 @@ import shutil
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 
 from purerl import run
 from purerl.checks import examine_network
@@ -18,12 +20,18 @@ from purerl.experiment.definition import Part
 from purerl.experiment.loading import find_source
 from purerl.machine import array_files
 from purerl.machine.state_arrays import flatten
+from purerl.ppo import running_moments
 from purerl.runs import checkpoint_folder, taken_parts
 from purerl.runs.loaded_run import load
 from tests.experiment.test_resumed_settings import refusal
 from tests.runs import coded_experiment
 
 pytestmark = pytest.mark.usefixtures("file_is_compiled_quickly", "programs_are_kept")
+
+
+class SimpleState(struct.PyTreeNode):
+    normalizer: object
+
 
 CODED = coded_experiment.__file__
 RATES = ["--parts.decoder.rate", "0"]
@@ -188,21 +196,38 @@ def test_one_entry_has_the_units_of_one_run(old):
         taken_parts.read_parts(both, abstract)
 
 
-def test_an_arrays_units_become_those_of_the_entry_policy(old):
-    """A teacher that was told all is read by a run whose observation is a dict."""
+def test_an_arrays_units_are_cut_into_entries():
+    """A run that was told all is read by one that has it in parts, and a picture beside."""
+    leaves = {f"normalizer/{of}/value": np.arange(5.0) for of in ("mean", "variance")}
+    leaves["params/params/head/kernel"] = np.ones((2, 2))
+    example = {"a": jnp.zeros(2), "b": jnp.zeros(3), "eyes": jnp.zeros((1, 4, 4), jnp.uint8)}
+    abstract = SimpleState(normalizer=running_moments.init(example))
+    joined = taken_parts._joined(abstract, ("b", "eyes", "a")).normalizer
+    assert joined.mean.value.shape == joined.variance.error.shape == (5,)
+    cut = taken_parts._cut(leaves, abstract, ("b", "eyes", "a"))
+    for of in ("mean", "variance"):
+        np.testing.assert_array_equal(cut[f"normalizer/{of}/b/value"], [0, 1, 2])
+        np.testing.assert_array_equal(cut[f"normalizer/{of}/a/value"], [3, 4])
+    assert len(cut) == 5 and cut["params/params/head/kernel"].shape == (2, 2)
+
+
+def test_a_run_that_was_told_in_an_array_lends_its_units_to_a_dict(old):
     abstract = abstract_state(*objects.build(coded_experiment.experiment)[:3])
     mean, variance = abstract.normalizer.mean, abstract.normalizer.variance
     both = abstract.normalizer.replace(
         mean={"more": mean, "policy": mean}, variance={"more": variance, "policy": variance}
     )
-    part = {"decoder": Part(run=str(old), reads=("policy",))}
-    leaves, _ = taken_parts.read_parts(part, abstract.replace(normalizer=both))
+    dicts = abstract.replace(normalizer=both)
+    leaves, _ = taken_parts.read_parts({"decoder": Part(run=str(old), reads=("policy",))}, dicts)
     taken = {key: x for key, x in leaves.items() if key.startswith("normalizer/")}
-    assert sorted(taken) == [
-        f"normalizer/{of}/policy/{x}" for of in ("mean", "variance") for x in ("error", "value")
-    ]
+    assert len(taken) == 4
     for key, x in taken.items():
         assert (x == saved(old)[key.replace("/policy", "")]).all(), key
+    with pytest.raises(
+        UserError, match=r"normalizer/mean/error is .* \[1\]\] in it and .* \[2\]\]"
+    ):
+        both = {"decoder": Part(run=str(old), reads=("policy", "more"))}
+        taken_parts.read_parts(both, dicts)
 
 
 def test_a_rate_of_its_own_is_of_its_parameters_alone():
