@@ -2,8 +2,8 @@
 
 What it has to learn is supervised: its guess of `privileged`, from pictures, from what the body
 feels and from its memory. The policy, which reads the guess in place of the truth, is a part of the
-run that was told; it may stay as it is, or learn on. Teachers that are told more than their students
-see: Chen et al. 2019, "Learning by Cheating" (arXiv:1912.12294); states of the student's own making:
+run that was told; it may stay as it is, or learn on. Teachers that are told more than students see:
+Chen et al. 2019, "Learning by Cheating" (arXiv:1912.12294); to learn on states of one's own making:
 Ross et al. 2011, "DAgger" (arXiv:1011.0686).
 
 Leading axes of all arrays, `...`, are batch axes.
