@@ -15,8 +15,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from purerl import Array, Network, PolicyOutput, PyTree, networks
-from purerl.eyes import Convolutions, Encoder
+from purerl import Array, Network, PolicyOutput, PyTree, eyes as seeing, networks
 
 FELT, TOLD, PICTURES = "policy", "privileged", "eyes"  # entries of an observation
 KINK = 0.3  # beyond it an error costs in proportion: a gap that is taken for the next is no outlier
@@ -26,7 +25,7 @@ KINK = 0.3  # beyond it an error costs in proportion: a gap that is taken for th
 class Options:
     """Sizes of the network."""
 
-    eyes: Encoder = field(default_factory=Encoder)
+    eyes: seeing.Encoder = field(default_factory=seeing.Encoder)
     features: int = 256
     """What it makes of pictures and feelings, before its memory."""
     hidden: int = 128
@@ -49,7 +48,7 @@ class Guesser(nn.Module):
         guess from what it guesses, in that one's deviations.
         """
         o, felt, told = self.options, observation[FELT], observation[TOLD]
-        pictures, encoder = observation[PICTURES], Convolutions(o.eyes)
+        pictures, encoder = observation[PICTURES], seeing.Convolutions(o.eyes)
         seen = [encoder(pictures[..., i, :, :]) for i in range(pictures.shape[-3])]
         now = nn.swish(nn.Dense(o.features)(jnp.concatenate([felt, *seen], -1)))
         memory, remembered = nn.GRUCell(o.hidden, name="cell")(memory, now)
