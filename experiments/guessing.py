@@ -33,6 +33,12 @@ class Options:
     policy: networks.MlpOptions = networks.MlpOptions()
     """Of the run that was told."""
 
+    def __post_init__(self) -> None:
+        """Refuses sizes of which no network can be made."""
+        if min(self.features, self.hidden) < 1:
+            said = f"features is {self.features}, hidden {self.hidden}"
+            raise ValueError(f"{said}; a layer has at least 1 unit.")
+
 
 class Guesser(nn.Module):
     """Guesses what is privileged; acts by what it feels and by its guess."""

@@ -108,8 +108,10 @@ def test_its_cost_is_smooth_at_the_kink(size):
     assert jax.grad(guessing.huber)(size) == pytest.approx(wanted)
 
 
-def test_an_observation_without_pictures_is_refused():
+def test_what_no_network_can_be_made_of_is_refused():
     with pytest.raises(ValueError, match="has policy, privileged; this network needs policy, priv"):
         guessing.guess(OPTIONS, {"policy": jnp.zeros(3), "privileged": jnp.zeros(2)}, ACTIONS)
     with pytest.raises(ValueError, match="has one array; this network needs"):
         guessing.guess(OPTIONS, jnp.zeros(3), ACTIONS)
+    with pytest.raises(ValueError, match="features is 0, hidden 128; a layer has at least 1 unit"):
+        guessing.Options(features=0)
