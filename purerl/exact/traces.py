@@ -39,6 +39,46 @@ def constants(closed: core.ClosedJaxpr) -> Iterator[Any]:
         yield from constants(sub)
 
 
+def read_in(closed: core.ClosedJaxpr) -> set[Any]:
+    """Returns the variables that the equations of a trace read, and its results."""
+    read = [*(v for eqn in closed.jaxpr.eqns for v in eqn.invars), *closed.jaxpr.outvars]
+    return {x for x in read if isinstance(x, core.Var)}
+
+
+def split(
+    closed: core.ClosedJaxpr, wanted: Sequence[bool]
+) -> tuple[core.ClosedJaxpr, core.ClosedJaxpr]:
+    """Returns a trace as two: what its wanted results need, and the rest.
+
+    The first one's results are those that it computes, in their order, and then what the second
+    takes beside the arguments. The second one's are the others.
+    """
+    jaxpr = closed.jaxpr
+    live = {x for x, want in zip(jaxpr.outvars, wanted, strict=True)
+            if want and isinstance(x, core.Var)}  # fmt: skip
+    early, late = list[core.JaxprEqn](), list[core.JaxprEqn]()
+    for eqn in reversed(jaxpr.eqns):
+        needed = bool(eqn.effects) or not live.isdisjoint(eqn.outvars)
+        (early if needed else late).append(eqn)
+        live |= {x for x in eqn.invars if needed and isinstance(x, core.Var)}
+    made, put_off = ({v for eqn in some for v in eqn.outvars} for some in (early, late))
+
+    def is_off(x: Any) -> bool:
+        return isinstance(x, core.Var) and x in put_off
+
+    taken = list(dict.fromkeys(x for eqn in late[::-1] for x in eqn.invars
+                               if isinstance(x, core.Var) and x in made))  # fmt: skip
+    first = [x for x in jaxpr.outvars if not is_off(x)] + taken
+    second = [x for x in jaxpr.outvars if is_off(x)]
+    parts = (jaxpr.invars, early, first), ([*jaxpr.invars, *taken], late, second)
+    return tuple(
+        core.ClosedJaxpr(
+            jaxpr.replace(invars=reads, eqns=eqns[::-1], outvars=results), closed.consts
+        )
+        for reads, eqns, results in parts
+    )  # type: ignore[return-value]
+
+
 def has_loop(closed: core.ClosedJaxpr) -> bool:
     """Tells whether a trace has a loop at any depth.
 

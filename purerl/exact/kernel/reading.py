@@ -1,6 +1,8 @@
 """From a trace to the values of a kernel: loops, branches and calls; `rules.py` has the rest."""
 
+import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -13,6 +15,8 @@ from purerl.exact.kernel.builder import Builder
 from purerl.exact.kernel.rules import RULES
 from purerl.exact.kernel.values import Block, Const, Held, NoRuleError, Value
 from purerl.exact.kernel.zeros import Zeros
+
+MUCH = 256  # numbers: of so many in all, what only a next round reads is computed only for one
 
 
 class Program(NamedTuple):
@@ -61,6 +65,7 @@ class _Reader:
     def __init__(self, refuse: Callable[[Missing], None]):
         self.build, self.refuse = Builder(), refuse
         self.caller = ""  # the line that called the function of JAX which is read
+        self.used: set[Any] = set()  # variables that an equation or a result reads
 
     def argument(self, aval: Any) -> Held:
         """Returns what an argument of the trace is in the kernel."""
@@ -79,6 +84,7 @@ class _Reader:
 
     def run(self, closed: core.ClosedJaxpr, *args: Value) -> list[Value]:
         """Returns a trace's results."""
+        self.used |= traces.read_in(closed)
         return traces.evaluate(closed, self._equation, self._constant, *args)
 
     def _equation(self, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
@@ -111,11 +117,10 @@ class _Reader:
         kinds = {"b": np.bool_, "f": np.float32}
         return self.build.held(aval.shape, kinds.get(getattr(aval.dtype, "kind", ""), np.int32))
 
-    def _round(self, role: str, carry: Sequence[Held], closed: Any, consts: Any) -> tuple:
-        """Returns a block that runs a trace on the carry, and its results."""
+    def _round(self, role: str, carry: Sequence[Held], run: Callable[..., list]) -> tuple:
+        """Returns a block that runs something on the carry, and its results."""
         with self.build.inside(role) as block:
-            names = [Held(x.shape, x.kind, block, x) for x in carry]
-            return block, self.run(closed, *consts, *names)
+            return block, run(*(Held(x.shape, x.kind, block, x) for x in carry))
 
     def _carry(self, starts: Sequence[Value]) -> list[Held]:
         return [Held(x.shape, x.kind, self.build.blocks[-1]) for x in starts]
@@ -127,10 +132,49 @@ def _while(reader: _Reader, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
         raise NoRuleError("a vmapped loop")
     n, m = p["cond_nconsts"], p["body_nconsts"]
     carry = reader._carry(args[n + m :])
-    test, (going,) = reader._round("while", carry, p["cond_jaxpr"], args[:n])
-    body, results = reader._round("while", carry, p["body_jaxpr"], args[n : n + m])
+    goes_on = partial(reader.run, p["cond_jaxpr"], *args[:n])
+    read = traces.read_in(p["cond_jaxpr"])
+    tested = [x in read for x in p["cond_jaxpr"].jaxpr.invars[n:]]
+    wanted = [x in reader.used or y for x, y in zip(eqn.outvars, tested, strict=True)]
+    test, (going,) = reader._round("while", carry, goes_on)
+    once = partial(_a_round, reader, p["body_jaxpr"], wanted, goes_on, args[n : n + m])
+    body, results = reader._round("while", carry, once)
     here, starts = reader.build.blocks[-1], list(args[n + m :])
     return [*reader.build.step(values.Loop(here, starts, carry, body, results, None, test, going))]
+
+
+def _a_round(
+    reader: _Reader, body: core.ClosedJaxpr, wanted: Any, goes_on: Any, consts: Any, *carry: Value
+) -> list[Value]:
+    """A round of a loop. What only a next round reads, it computes only if there is one.
+
+    So the Hessian of Newton's last iteration, and its factor, are not computed.
+
+    Args:
+      reader: of the loop.
+      body: its trace.
+      wanted: of each carried value, whether the test reads it, or what comes after the loop.
+      goes_on: the test, of what is carried.
+      consts: what the body reads beside the carry.
+      *carry: at the beginning of the round.
+    """
+    early, late = traces.split(body, wanted)
+    build, off = reader.build, [x in late.jaxpr.outvars for x in body.jaxpr.outvars]
+    if sum(math.prod(v.aval.shape) for x in late.jaxpr.eqns for v in x.outvars) < MUCH:
+        return reader.run(body, *consts, *carry)
+    found = iter(reader.run(early, *consts, *carry))
+    after = [old if x else next(found) for x, old in zip(off, carry, strict=True)]
+    (going,) = goes_on(*after)
+    with build.inside("branch") as last:
+        pass
+    with build.inside("branch") as another:
+        later = reader.run(late, *consts, *carry, *found)
+    old = [x for x, put in zip(carry, off, strict=True) if put]
+    writes = [Held(x.shape, x.kind, build.blocks[-1]) for x in old]
+    which = build.map("convert_element_type", going, kind="i")
+    step = values.Choice(build.blocks[-1], [which], writes, [last, another], [old, later])
+    chosen = iter(build.step(step))
+    return [next(chosen) if x else y for x, y in zip(off, after, strict=True)]
 
 
 def _scan(reader: _Reader, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
@@ -139,7 +183,7 @@ def _scan(reader: _Reader, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
     if len(args) > n + m or len(eqn.outvars) > m:
         return _written_out(reader, p, args, n, m)
     carry = reader._carry(args[n:])
-    body, results = reader._round("scan", carry, p["jaxpr"], args[:n])
+    body, results = reader._round("scan", carry, partial(reader.run, p["jaxpr"], *args[:n]))
     step = values.Loop(reader.build.blocks[-1], list(args[n:]), carry, body, results, p["length"])
     return list(reader.build.step(step))
 

@@ -9,6 +9,7 @@ import pytest
 from jax import lax
 
 from purerl import exact
+from purerl.exact import traces
 from purerl.exact.kernel import levels, memory, reading, schedule, statements, values
 from purerl.exact.kernel.statements import Statement
 from tests.exact.kernel import by_one_lane, by_warps, needs_compiler
@@ -258,3 +259,55 @@ def test_what_no_later_round_reads_is_computed_in_the_last_one_alone(read, tmp_p
     assert all(
         (a.view(np.int32) == b.view(np.int32)).all() for a, b in zip(one, warps, strict=True)
     )
+
+
+def iterations(after):
+    """Rounds that carry a matrix, which the next round alone reads, or what comes after, too."""
+
+    def body(c):
+        y, matrix, number = c
+        y = 0.7 * jnp.sin(y) + 0.1 * matrix.sum(0)
+        away = jnp.abs(y[:, None] - y)
+        return y, jnp.exp(-away) / (1.0 + away) - jnp.tanh(away), number + 1
+
+    def run(x):
+        goes_on = lambda c: (c[2] < 5) & (c[0].sum() < 20.0)  # noqa: E731
+        y, matrix, number = lax.while_loop(goes_on, body, (x, jnp.zeros((9, 9)), jnp.int32(0)))
+        return (y, number, matrix) if after else (y, number)
+
+    return run
+
+
+@needs_compiler
+@pytest.mark.parametrize("after", [False, True])
+def test_what_only_a_next_round_reads_is_not_computed_in_the_last_one(after, tmp_path):
+    kernel = exact.compile_kernel(iterations(after), X)
+    before, _, then = kernel.text.body.partition("else  {")
+    assert ("expf" in before) == after and ("expf" in then) != after and "sinf" in before
+    xs = np.stack([X, 0.1 * X, 9.0 * X])  # the last makes no round at all
+    one = by_one_lane(kernel.text, xs)
+    wanted = jax.tree.leaves(jax.jit(jax.vmap(iterations(after)))(xs))
+    assert len({*wanted[1].tolist()}) > 1, "each makes as many rounds as it needs"
+    for found, right in zip(one, wanted, strict=True):
+        np.testing.assert_allclose(found, np.reshape(right, found.shape), 1e-5, 1e-6)
+    warps = by_warps(kernel.text, xs, folder=tmp_path, environments=3, warps=2)
+    assert all(
+        (a.view(np.int32) == b.view(np.int32)).all() for a, b in zip(one, warps, strict=True)
+    )
+
+
+def test_a_trace_in_two_parts_computes_what_it_did():
+    def whole(a, b):
+        c = jnp.sin(a)
+        d = jnp.dot(c, b)
+        return c, d + a, jnp.cos(c).sum(), 3.0, b
+
+    closed = jax.make_jaxpr(whole)(X, X)
+    first, second = traces.split(closed, [True, False, True, False, False])
+    assert [x.primitive.name for x in second.jaxpr.eqns if x.primitive.name == "dot_general"]
+    assert not [x for x in first.jaxpr.eqns if x.primitive.name == "dot_general"]
+    way = traces.bind_equation, lambda x, _: x
+    c, cosine, three, same, *taken = traces.evaluate(first, *way, X, X)
+    (sum_,) = traces.evaluate(second, *way, X, X, *taken)
+    for found, right in zip((c, sum_, cosine, three, same), whole(X, X), strict=True):
+        np.testing.assert_array_equal(found, right)
