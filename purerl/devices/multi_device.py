@@ -20,7 +20,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDev
 from purerl import exact
 from purerl.core.env import Env
 from purerl.core.records import Array, Metrics, Network, PyTree, TrainState
-from purerl.devices.compilation import Compiling, portable, shapes, start, unordered
+from purerl.devices.compilation import Compiling, compiled, portable, shapes, start, unordered
 from purerl.devices.shards import AXIS, Shards, improve
 from purerl.ppo import algorithm
 from purerl.ppo.config import Config
@@ -222,15 +222,16 @@ def compile_collects(
     places = resized({name: getattr(abstract, name) for name in PLACES}, layout.size)
 
     def build(device: Any) -> Any:
-        return program.lower(*shapes((learned, places), SingleDeviceSharding(device))).compile()
+        here = SingleDeviceSharding(device)
+        return compiled(program.lower(*shapes((learned, places), here)))
 
     (device, _), *others = layout.here
     # The first alone: where the persistent cache serves all devices, the others find it there.
-    compiled = [build(device)]
+    collects = [build(device)]
     with ThreadPoolExecutor() as pool:
-        compiled += pool.map(build, [device for device, _ in others])
+        collects += pool.map(build, [device for device, _ in others])
     traced = program.trace(learned, places)
-    return compiled, traced.out_info[1], unordered(traced)
+    return collects, traced.out_info[1], unordered(traced)
 
 
 def one_copy(layout: Layout, memory: PyTree, state: Spread) -> TrainState:

@@ -13,6 +13,7 @@ from purerl.exact.order import (
 from purerl.exact.portable import without_libraries as without_libraries
 from purerl.exact.rewriting import rewrite as rewrite
 from purerl.exact.xla_flags import (
+    TRITON_REDUCTIONS as TRITON_REDUCTIONS,
     equal_passes as equal_passes,
     how_chosen as how_chosen,
     is_portable as is_portable,

@@ -15,11 +15,12 @@ other. That changes no bit (`lab/2026-11-22-kernels.md`).
 import os
 import sys
 
+TRITON_REDUCTIONS = "xla_gpu_experimental_enable_fusion_block_level_rewriter"
 # What XLA does instead of timing.
 RULES = {
     "xla_gpu_autotune_level": "0",
     "xla_gpu_enable_triton_gemm": "false",
-    "xla_gpu_experimental_enable_fusion_block_level_rewriter": "true",
+    TRITON_REDUCTIONS: "true",
 }
 GRAPHS = {
     "xla_gpu_command_buffer_scheduling_mode": "CONCURRENT",

@@ -12,7 +12,7 @@ from dm_control.utils import rewards
 
 from purerl import run
 from purerl.checks.check_env import check_env
-from purerl.envs.suite import base, hopper, tasks
+from purerl.envs.suite import base, cheetah, hopper, tasks
 from purerl.envs.suite.rewards import SIGMOIDS, tolerance
 from tests import quick
 
@@ -297,6 +297,13 @@ def _contacts(model, data, qpos) -> int:
 
 
 @pytest.mark.slow
+def test_a_cheetah_falls_by_the_steps_that_it_runs_by():
+    """One kernel of 200 steps is too far from XLA's: starts took five sixths of a training."""
+    env = ours("cheetah-run", "jax")
+    assert env.domain.settling is env.physics and env.physics.substeps == 1
+    assert ours("cheetah-run").domain.settling.substeps == cheetah.SETTLING
+
+
 def test_random_joints_have_their_ranges():
     """Against dm_control's own draw, joint by joint: the same least and greatest."""
     for name in ("walker-stand", "humanoid-stand", "hopper-hop"):
