@@ -13,10 +13,12 @@ from purerl.exact import constants, traces, walk
 from purerl.exact.kernel import values
 from purerl.exact.kernel.builder import Builder
 from purerl.exact.kernel.rules import RULES
-from purerl.exact.kernel.values import Block, Const, Held, NoRuleError, Value
+from purerl.exact.kernel.values import Block, Const, Held, Map, NoRuleError, Value
 from purerl.exact.kernel.zeros import Zeros
 
 MUCH = 256  # numbers: of so many in all, what only a next round reads is computed only for one
+# Of a loop's carry, by its place, what follows: an operation like a map, of places and constants.
+Following = dict[int, tuple[Map, list[Any]]]
 
 
 class Program(NamedTuple):
@@ -131,16 +133,56 @@ def _while(reader: _Reader, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
     if p["cond_jaxpr"].out_avals[0].shape:
         raise NoRuleError("a vmapped loop")
     n, m = p["cond_nconsts"], p["body_nconsts"]
-    carry = reader._carry(args[n + m :])
-    goes_on = partial(reader.run, p["cond_jaxpr"], *args[:n])
+    starts, goes_on = list(args[n + m :]), partial(reader.run, p["cond_jaxpr"], *args[:n])
     read = traces.read_in(p["cond_jaxpr"])
     tested = [x in read for x in p["cond_jaxpr"].jaxpr.invars[n:]]
     wanted = [x in reader.used or y for x, y in zip(eqn.outvars, tested, strict=True)]
-    test, (going,) = reader._round("while", carry, goes_on)
     once = partial(_a_round, reader, p["body_jaxpr"], wanted, goes_on, args[n : n + m])
-    body, results = reader._round("while", carry, once)
-    here, starts = reader.build.blocks[-1], list(args[n + m :])
-    return [*reader.build.step(values.Loop(here, starts, carry, body, results, None, test, going))]
+
+    step = _loop(reader, {}, starts, goes_on, once)
+    if follow := _following(reader.build, starts, step.results):
+        step = _loop(reader, follow, starts, goes_on, once)
+    return _whole(reader.build, follow, reader.build.step(step))
+
+
+def _loop(
+    reader: _Reader, follow: Following, starts: Sequence[Value], goes_on: Any, once: Any
+) -> values.Loop:
+    """Reads a loop, which does not carry what follows from the rest of its carry."""
+    own = [i for i in range(len(starts)) if i not in follow]
+    reads, here = [starts[i] for i in own], reader.build.blocks[-1]
+    carry, whole = reader._carry(reads), partial(_whole, reader.build, follow)
+    test, (going,) = reader._round("while", carry, lambda *x: goes_on(*whole(x)))
+    body, results = reader._round("while", carry, lambda *x: once(*whole(x)))
+    return values.Loop(here, reads, carry, body, [results[i] for i in own], None, test, going)
+
+
+def _following(build: Builder, starts: Sequence[Value], results: Sequence[Value]) -> Following:
+    """Returns what of a loop's carry is always the same operation on the rest of it.
+
+    MJX carries which constraints are active beside the distances of which that is the sign.
+    """
+    place, found, needed = {id(x): i for i, x in enumerate(results)}, Following(), set[int]()
+    for i, x in enumerate(results):
+        if not isinstance(x, Map) or x.param is not None or x.size < MUCH or i in needed:
+            continue
+        args = [y if isinstance(y, Const) else place.get(id(y), -1) for y in x.args]
+        if any(y in found or y == -1 for y in args):
+            continue
+        begun = [starts[y] if isinstance(y, int) else y for y in args]
+        if build.map(x.op, *begun, kind=x.kind) is starts[i]:
+            found[i] = x, args
+            needed |= {y for y in args if isinstance(y, int)}
+    return found
+
+
+def _whole(build: Builder, follow: Following, own: Sequence[Value]) -> list[Value]:
+    """Returns a loop's whole carry: what it carries, and what follows from that."""
+    rest, places = iter(own), range(len(own) + len(follow))
+    known = {i: next(rest) for i in places if i not in follow}
+    for i, (like, args) in follow.items():
+        known[i] = build.map(like.op, *(known.get(y, y) for y in args), kind=like.kind)
+    return [known[i] for i in places]
 
 
 def _a_round(

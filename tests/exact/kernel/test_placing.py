@@ -296,6 +296,33 @@ def test_what_only_a_next_round_reads_is_not_computed_in_the_last_one(after, tmp
     )
 
 
+def signs(same):
+    """Rounds that carry numbers and which of them are below 0; at first, that of these or not."""
+
+    def body(c):
+        y, below, number = c
+        y = jnp.cos(3.0 * y) - 0.3 + 0.1 * jnp.where(below, y, 1.0).sum()
+        return y, y < 0.0, number + 1
+
+    def run(x):
+        x = jnp.outer(x, jnp.linspace(-1.0, 1.0, 32)).reshape(-1)
+        begun = x, x < 0.0 if same else x < 0.1, jnp.int32(0)
+        return lax.while_loop(lambda c: (c[2] < 4) & (c[0].sum() > -1e3), body, begun)
+
+    return run
+
+
+@needs_compiler
+@pytest.mark.parametrize("same", [True, False])
+def test_what_follows_from_the_carry_is_not_carried(same):
+    kernel = exact.compile_kernel(signs(same), X)
+    assert (kernel.text.memory < 3 * 288) == same, "not the signs beside the numbers of two rounds"
+    xs = np.stack([X, 0.1 * X])
+    wanted = jax.tree.leaves(jax.jit(jax.vmap(signs(same)))(xs))
+    for found, right in zip(by_one_lane(kernel.text, xs), wanted, strict=True):
+        np.testing.assert_allclose(found, np.reshape(right, found.shape), 1e-4, 1e-4)
+
+
 def test_a_trace_in_two_parts_computes_what_it_did():
     def whole(a, b):
         c = jnp.sin(a)
