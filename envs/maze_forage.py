@@ -33,7 +33,8 @@ class Options:
     reward: float = REWARD
     """For each treat."""
     forward_weight: float = 0.0
-    """Reward for each step of a body that runs ahead of itself at `target_speed` or more."""
+    """Reward for each step of an upright body that runs ahead of itself at `target_speed` or more:
+    without that condition it pushes itself along on its back."""
     target_speed: float = 0.5
     """Speed that earns all of it [m/s]."""
     rooms: int = 4
@@ -121,16 +122,15 @@ class Forage:
             pictures = sight.look(self.eyes, *given, boxes=walls)
             observation = {"policy": jnp.concatenate(parts), "eyes": pictures, "privileged": told}
         number = new.sum(dtype=jnp.float32)
-        ahead = readings.xmat[torso, :, 0] @ physics.qvel[:3]
-        forward = self.options.forward_weight * jnp.clip(ahead / self.options.target_speed, 0, 1)
+        up, ahead = readings.xmat[torso, 2, 2], readings.xmat[torso, :, 0] @ physics.qvel[:3]
+        forward = jnp.clip(up, 0, 1) * jnp.clip(ahead / self.options.target_speed, 0, 1)
         return State(
             physics=physics,
             observation=observation,
-            reward=self.options.reward * number + forward,
+            reward=self.options.reward * number + self.options.forward_weight * forward,
             terminated=found.all(),
             truncated=jnp.zeros((), bool),
-            metrics={"treats_count": number, "up": readings.xmat[torso, 2, 2],
-                     "forward_velocity": ahead},
+            metrics={"treats_count": number, "up": up, "forward_velocity": ahead},
             task=task | {"found": found},
         )  # fmt: skip
 

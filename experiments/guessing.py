@@ -64,7 +64,7 @@ class Guesser(nn.Module):
         read = jnp.concatenate([felt, jax.lax.stop_gradient(guess)], -1)
         acts = networks.Stack(o.policy.policy_hidden, o.policy.activation, name="policy")(read)
         normal = networks.GaussianHead(o.policy, self.action_size, name="head")(acts)
-        truth = jnp.concatenate([felt, told, jax.lax.stop_gradient(remembered)], -1)
+        truth = jnp.concatenate([felt, told], -1)
         value = networks.Stack(o.policy.value_hidden, o.policy.activation, name="value")(truth)
         away = jnp.abs(guess - told)
         losses = {"guess": huber(away).mean(-1), "guess_error": away.mean(-1)}

@@ -2,7 +2,8 @@
 
 python -m purerl.run rodent_maze --engine warp
 
-After 0.8 M steps it finds 0.4 of 12 treats; not trained further.
+After 0.8 M steps it finds 0.4 of 12 treats; not trained further. Running pays only upright: else it
+learned to push itself along on its back (`lab/2026-11-30-three-seeds-that-guess.md`).
 """
 
 import dataclasses
