@@ -2,10 +2,11 @@
 
 python -m purerl.run suite_gpu --env.task walker-run --num-seeds 5
 
-Expected, of 1000, with three seeds on an H200 and engine `jax`: finger-spin 983 after 20 M steps, in
-98 s, walker-run 840 after 10 M in 70 s; hopper-hop 561 after 50 M. With a discount of their own,
-acrobot-swingup has 435 after 100 M steps, in 97 s, walker-run 874 after 60 M in 164 s, and 884 after
-100 M; the sparse acrobot 148, with whole episodes too. Others, and how each was trained: lab/2026-11-28-control-suite.md. Humanoids: `suite_humanoid`.
+Expected, of 1000, with three seeds on an H200 and engine `jax`: finger-spin 983 after 20 M steps,
+in 98 s, walker-run 840 after 10 M in 70 s; hopper-hop 561 after 50 M. With a discount of their own
+acrobot-swingup has 435 after 100 M, in 97 s, walker-run 874 after 60 M in 164 s, and 884 after
+100 M; the sparse acrobot 148, with whole episodes too. How each was trained, and others:
+lab/2026-11-28-control-suite.md, lab/2026-11-30-six-tasks.md. Humanoids: `suite_humanoid`.
 """
 
 import dataclasses
