@@ -90,10 +90,9 @@ class _Reader:
         return traces.evaluate(closed, self._equation, self._constant, *args)
 
     def _equation(self, eqn: core.JaxprEqn, *args: Value) -> list[Value]:
-        name, source = eqn.primitive.name, traces.source(eqn)
-        source = self.caller or source if "/jax/_src/" in source else source
+        name = eqn.primitive.name
         if name in traces.CALLS:
-            caller, self.caller = self.caller, source
+            caller, self.caller = self.caller, self._source(eqn)
             results = self.run(traces.sub_jaxprs(eqn)[0], *args)
             self.caller = caller
             return results
@@ -111,8 +110,12 @@ class _Reader:
             why = ""
         except NoRuleError as error:
             why = str(error)
-        self.refuse(Missing(name, why, source))
+        self.refuse(Missing(name, why, self._source(eqn)))
         return [self._unknown(v.aval) for v in eqn.outvars]
+
+    def _source(self, eqn: core.JaxprEqn) -> str:
+        source = traces.source(eqn)
+        return self.caller or source if "/jax/_src/" in source else source
 
     def _unknown(self, aval: Any) -> Held:
         """Returns what stands for a result that has no rule, while all of these are listed."""
