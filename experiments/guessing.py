@@ -47,8 +47,10 @@ class Guesser(nn.Module):
     action_size: int
 
     @nn.compact
-    def __call__(self, observation: PyTree, memory: Array) -> tuple[PolicyOutput, Array]:
-        """Moves the memory [..., H] on by one observation, and answers from it.
+    def __call__(
+        self, observation: PyTree, memory: Array, *, is_first: Array | None = None
+    ) -> tuple[PolicyOutput, Array]:
+        """Moves the memory [..., H] on, and answers from it; `is_first` as of `networks.remember`.
 
         Its losses are `guess`, and `guess_error`, which is to be logged: the mean distance of the
         guess from what it guesses, in that one's deviations.
@@ -57,7 +59,8 @@ class Guesser(nn.Module):
         pictures, encoder = observation[PICTURES], seeing.Convolutions(o.eyes)
         seen = [encoder(pictures[..., i, :, :]) for i in range(pictures.shape[-3])]
         now = nn.swish(nn.Dense(o.features)(jnp.concatenate([felt, *seen], -1)))
-        memory, remembered = nn.GRUCell(o.hidden, name="cell")(memory, now)
+        cell = nn.GRUCell(o.hidden, name="cell")
+        memory, remembered = networks.remember(cell, memory, now, is_first)
         both = nn.swish(nn.Dense(o.hidden)(jnp.concatenate([remembered, now], -1)))
         guess = nn.Dense(told.shape[-1], name="guess")(both)
         # The policy's gradient stops here: what it would like to be told is not what is there.
@@ -88,7 +91,8 @@ def guess(options: Options, observation: PyTree, action_size: int) -> Network:
     if there != sorted((FELT, TOLD, PICTURES)):
         raise ValueError(
             f"The observation has {', '.join(there)}; this network needs {FELT}, {TOLD} and "
-            f"{PICTURES}: an environment with eyes that tells the value function more."
+            f"{PICTURES}: an environment that tells the value function more, with eyes "
+            "(--env.eyes.number 2, say)."
         )
     memory = jnp.zeros(options.hidden)
     return networks.from_linen(Guesser(options, action_size), observation, memory)

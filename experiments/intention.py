@@ -234,9 +234,9 @@ def reuse(build: Callable[[Any, PyTree, int], Network]) -> Callable[..., Network
             own = moves.init(own_key, observation[FELT], jnp.zeros(options.code))
             return {"params": {"task": params, **own["params"]}}, memory
 
-        def apply(params: PyTree, observation: PyTree, memory: PyTree, *noise: PyTree) -> tuple:
+        def apply(params: PyTree, observation: PyTree, *given: PyTree, **more: Any) -> tuple:
             own = dict(params["params"])
-            output, memory = task.apply(own.pop("task"), observation, memory, *noise)
+            output, memory = task.apply(own.pop("task"), observation, *given, **more)
             wish = output.distribution.loc
             answer: Any = moves.apply({"params": own}, observation[FELT], wish)
             policy, losses = answer

@@ -8,8 +8,9 @@ one of `rodent_gaps` does, whose policy it has: `guessing.py` has the network.
 
 Expected of the first command: 14.2 gaps in 10 s, each of three seeds (128 corridors), after 11 min
 on one H200; of the second, one seed: 11.4 after 50 min on two CPU cores. The told one crosses 17.
-With an eye closed it crosses 3 to 6 (`lab/2026-11-30-three-seeds-that-guess.md`). A policy of its
-own crosses 3.5 to 3.8 after 24 M steps (`lab/2026-11-30-a-guess-of-what-the-other-was-told.md`).
+With its left eye closed it crosses 5.7, with the right one 3.0
+(`lab/2026-11-30-three-seeds-that-guess.md`). A policy of its own crosses 3.5 to 3.8 after 24 M
+steps (`lab/2026-11-30-a-guess-of-what-the-other-was-told.md`).
 """
 
 import dataclasses

@@ -38,6 +38,8 @@ class Part:
     def __post_init__(self) -> None:
         """Raises ValueError for a rate that is none, and for units that nobody has chosen."""
         check_least(self, ValueError, rate=0)
+        if isinstance(self.reads, str):
+            raise ValueError(f"reads is {self.reads!r}; give a tuple of names: ({self.reads!r},).")
         if bool(self.run) != (self.reads is not None):
             raise ValueError(
                 f"run is {self.run!r} and reads is {self.reads}; a part of another run needs both: "

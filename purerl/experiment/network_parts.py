@@ -66,10 +66,10 @@ def with_parts(
         return next((part.rate for name, part in parts.items() if belongs(path, name)), 1.0)
 
     # No gradient: Adam's moments stay 0, and the norm by which gradients are clipped is the rest's.
-    def apply(params: PyTree, *given: PyTree) -> tuple[PolicyOutput, PyTree]:
+    def apply(params: PyTree, *given: PyTree, **more: Any) -> tuple[PolicyOutput, PyTree]:
         stop = jax.lax.stop_gradient
         moving = map_named(lambda path, x: x if rate(path) else stop(x), params)
-        return network.apply(moving, *given)
+        return network.apply(moving, *given, **more)
 
     held = tuple(entry for part in parts.values() for entry in part.reads or ())
     scale = partial(map_named, lambda path, x: rate(path) * x)

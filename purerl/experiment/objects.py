@@ -233,8 +233,8 @@ def in_float32(network: Network) -> Network:
     It may compute in half precision; its memory keeps the dtype that it has.
     """
 
-    def apply(params: PyTree, *given: PyTree) -> tuple[PolicyOutput, PyTree]:
-        output, memory = network.apply(params, *given)
+    def apply(params: PyTree, *given: PyTree, **more: Any) -> tuple[PolicyOutput, PyTree]:
+        output, memory = network.apply(params, *given, **more)
         return jax.tree.map(lambda x: x.astype(jnp.float32), output), memory
 
     return network._replace(apply=apply)

@@ -97,15 +97,18 @@ class Seeing(nn.Module):
     network: nn.Module
 
     @nn.compact
-    def __call__(self, observation: PyTree, *memory: PyTree) -> PolicyOutput | tuple:
-        """Applies both to observations with pictures [..., E, H, W]."""
+    def __call__(
+        self, observation: PyTree, *memory: PyTree, is_first: Array | None = None
+    ) -> PolicyOutput | tuple:
+        """Applies both to observations with pictures [..., E, H, W]; see `networks.remember`."""
         pictures = observation[PICTURES]
         number = pictures.shape[-3]
         encoders = [Convolutions(self.options) for _ in range(1 if self.options.shared else number)]
         seen = [encoders[i % len(encoders)](pictures[..., i, :, :]) for i in range(number)]
         rest = {name: x for name, x in observation.items() if name != PICTURES}
         joined = jnp.concatenate([rest["policy"], *seen], axis=-1)
-        return self.network(rest | {"policy": joined}, *memory)
+        more = {} if is_first is None else {"is_first": is_first}
+        return self.network(rest | {"policy": joined}, *memory, **more)
 
 
 def mlp(options: MlpOptions, observation: PyTree, action_size: int) -> Network:

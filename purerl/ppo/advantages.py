@@ -46,15 +46,9 @@ def discounted_sum(delta: Array, decay: Array) -> Array:
 
 
 def gae(
-    reward: Array,
-    value: Array,
-    next_value: Array,
-    terminated: Array,
-    done: Array,
-    valid: Array,
-    gamma: float,
-    lambda_: float,
-) -> Array:
+    reward: Array, value: Array, next_value: Array, terminated: Array, done: Array, valid: Array,
+    gamma: float, lambda_: float,
+) -> Array:  # fmt: skip
     """Returns A_t = delta_t + gamma * lambda * (1 - done_t) * A_{t+1}, [T].
 
     Args:

@@ -160,8 +160,9 @@ def unroll(network: Network, params: PyTree, batch: Batch, memory: PyTree) -> Po
     Returns:
       Gaussians and values, [T', M, ...].
     """
-    if not is_recurrent(memory):
-        return network.apply(params, batch.observation, memory, *batch.drawn)[0]
+    more = {"is_first": batch.is_first} if network.sequences else {}
+    if more or not is_recurrent(memory):
+        return network.apply(params, batch.observation, memory, *batch.drawn, **more)[0]
 
     # Backpropagation through time reaches back to the rollout's first step and stops there: the
     # memory at that step is data, and of older parameters.

@@ -3,6 +3,7 @@
 The algorithm knows only `Network(init, apply)`. This module alone imports a network library.
 """
 
+import inspect
 import math
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -129,6 +130,29 @@ class MlpActorCritic(nn.Module):
         return PolicyOutput(normal, nn.Dense(1, name="value_out")(value)[..., 0])
 
 
+def remember(cell: Any, memory: PyTree, seen: Array, is_first: Array | None) -> tuple[Any, Array]:
+    """Moves a memory on by what is seen in one step, or in T of them, of M environments.
+
+    Args:
+      cell: of Flax, a submodule of the network.
+      memory: leaves [M, H], before the first step.
+      seen: [M, F]; with `is_first`, [T, M, F].
+      is_first: None, or [T, M] bool, where an episode begins: the memory is cleared before.
+
+    Returns:
+      The memory after the last step, and what it says in each: [M, H] or [T, M, H].
+    """
+    if is_first is None:
+        return cell(memory, seen)
+
+    def step(cell: Any, memory: PyTree, row: tuple[Array, Array]) -> tuple:
+        fresh = jax.tree.map(lambda x: jnp.where(row[1][:, None], 0.0, x), memory)
+        return cell(fresh, row[0])
+
+    steps = nn.scan(step, variable_broadcast="params", split_rngs={"params": False})
+    return steps(cell, memory, (seen, is_first))
+
+
 class RecurrentActorCritic(nn.Module):
     """A cell over what the policy may read; the value also reads the rest of the observation."""
 
@@ -136,17 +160,21 @@ class RecurrentActorCritic(nn.Module):
     action_size: int
 
     @nn.compact
-    def __call__(self, observation: PyTree, memory: PyTree) -> tuple[PolicyOutput, PyTree]:
-        """Moves the memory on by one observation, and answers from it.
+    def __call__(self, observation: PyTree, memory: PyTree, *, is_first: Any = None) -> Any:
+        """Moves the memory on by one observation, or by T of them, and answers from it.
 
         Args:
           observation: leaves [..., O].
           memory: leaves [..., H]; an LSTM has two.
+          is_first: see `remember`.
+
+        Returns:
+          The `PolicyOutput`, and the memory that follows.
         """
         o = self.options
         encoded = Stack(o.encoder, o.activation, name="encoder")(policy_features(observation))
         cell = {"gru": nn.GRUCell, "lstm": nn.OptimizedLSTMCell}[o.cell](o.hidden, name="cell")
-        memory, remembered = cell(memory, encoded)
+        memory, remembered = remember(cell, memory, encoded, is_first)
         normal = GaussianHead(o, self.action_size, name="head")(remembered)
         # The value function sees what the policy may not, such as the state of the simulation.
         features = jnp.concatenate([remembered, value_features(observation)], axis=-1)
@@ -168,9 +196,13 @@ def from_linen(module: nn.Module, observation: PyTree, memory: PyTree = ()) -> N
 
     A network that draws noise of its own is made so: `from_linen(...)._replace(draw=draw)`. Its
     module takes the noise as one more argument, or none where the policy acts by its mean.
+
+    A module with a memory whose call takes `is_first` (see `remember`) learns from all steps of a
+    rollout at once; of another, the steps are taken one after another.
     """
     # A module without a memory takes one argument and returns one thing, which is what most have.
     recurrent = len(jax.tree.leaves(memory)) > 0
+    sequences = recurrent and "is_first" in inspect.signature(type(module).__call__).parameters
     if any(jnp.any(x != 0) for x in jax.tree.leaves(memory)):
         raise ValueError("A memory starts an episode at zero; this one has other numbers in it.")
     arguments = (observation, memory) if recurrent else (observation,)
@@ -178,13 +210,13 @@ def from_linen(module: nn.Module, observation: PyTree, memory: PyTree = ()) -> N
     def init(key: Array) -> tuple[PyTree, PyTree]:
         return module.init(key, *arguments), memory
 
-    def apply(params: PyTree, observation: PyTree, memory: PyTree, *noise: PyTree) -> tuple:
+    def apply(params: PyTree, observation: PyTree, memory: PyTree, *noise: Any, **at: Any) -> tuple:
         stay = {k: jax.lax.stop_gradient(x) for k, x in params.items() if k != "params"}
         more = (memory, *noise) if recurrent else noise
-        output: Any = module.apply(params | stay, observation, *more)
+        output: Any = module.apply(params | stay, observation, *more, **at)
         return output if recurrent else (output, memory)
 
-    return Network(init=init, apply=apply)
+    return Network(init=init, apply=apply, sequences=sequences)
 
 
 def mlp(options: MlpOptions, observation: PyTree, action_size: int) -> Network:

@@ -111,16 +111,9 @@ def rollout(
 
 
 def _step(
-    config: Config,
-    env: Env,
-    network: Network,
-    state: TrainState,
-    fresh: State,
-    now: RolloutState,
-    drawn: tuple,
-    white: Array,
-    noise: Normal | None,
-) -> tuple[RolloutState, Transition]:
+    config: Config, env: Env, network: Network, state: TrainState, fresh: State, now: RolloutState,
+    drawn: tuple, white: Array, noise: Normal | None,
+) -> tuple[RolloutState, Transition]:  # fmt: skip
     """Acts once in every environment, and starts anew those whose episode has ended.
 
     Args:

@@ -3,7 +3,7 @@
 No code of that run is executed: its checkpoint says which arrays it has, of which shapes.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,10 @@ def read_parts(parts: Mapping[str, Part], abstract: PyTree) -> tuple[Leaves, dic
             raise UserError(f"parts.{name}.run: {error}") from error
         twice = [key for key in found if (found[key] != leaves.get(key, found[key])).any()]
         if twice:
-            raise UserError(f"parts.{name}: {twice[0]} is another in the run of a part before it.")
+            raise UserError(
+                f"parts.{name}: its {twice[0]} is not that of a part before it: give parts that "
+                "read the same entries one run, one checkpoint and one `reads`."
+            )
         leaves |= found
     return leaves, facts
 
@@ -61,6 +64,8 @@ def _read(name: str, part: Part, abstract: PyTree) -> tuple[Leaves, dict[str, An
         if not any(belongs(key, name) for key in there):
             raise UserError(unknown_name("part", name, top_names(there), f" in {run.path}"))
         array = "normalizer/mean/value" in stored and isinstance(abstract.normalizer.mean, dict)
+        if array and part.reads:
+            _check_cut(part.reads, abstract, stored["normalizer/mean/value"]["shape"][0])
         like = _joined(abstract, part.reads or ()) if array else abstract
         leaves, meta = checkpoint.load_leaves(path, like, owners, asked)
     except checkpoint_folder.DamagedError as error:
@@ -68,6 +73,20 @@ def _read(name: str, part: Part, abstract: PyTree) -> tuple[Leaves, dict[str, An
     facts = {"run": run.manifest["run_id"], "update": meta["update"]}
     facts |= {"sha256": digest_leaves(leaves)}
     return (_cut(leaves, abstract, part.reads or ()) if array else leaves), facts
+
+
+def _check_cut(reads: Sequence[str], abstract: PyTree, size: int) -> None:
+    """Raises UserError unless an array of a size can be these entries, one after another."""
+    sizes = {n: x.value.size for n, x in abstract.normalizer.mean.items() if x is not None}
+    said = f"reads is {', '.join(reads)}"
+    if "policy" in reads[1:]:
+        raise UserError(f"{said}: an array begins with what the policy may read; name that first.")
+    if (own := sum(sizes.get(name, 0) for name in reads)) != size:
+        there = ", ".join(f"{name} ({n})" for name, n in sizes.items())
+        raise UserError(
+            f"{said}, {own} numbers, and the observation of that run is an array of {size}: name "
+            f"the entries that it had, in their order. There are: {there}."
+        )
 
 
 def _joined(abstract: PyTree, reads: Iterable[str]) -> PyTree:

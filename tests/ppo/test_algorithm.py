@@ -223,7 +223,7 @@ def test_truncation_bootstraps_from_the_observation_before_the_reset():
 
 @pytest.mark.slow
 def test_recurrent_memory_restarts_with_each_episode_in_rollout_and_learner():
-    """The learner's unroll, from the stored memory, gives the rollout's values bit for bit."""
+    """The learner's unroll, from the stored memory, gives the rollout's values."""
     env, network, state = setup(recurrent=True)
     update = partial(UPDATE, CONFIG, env, network)
     for _ in range(2):  # so that memories are not zero when the rollout begins
@@ -251,6 +251,30 @@ class BadStarts(Walk):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("cell", ["gru", "lstm"])
+def test_all_steps_at_once_teach_what_they_teach_one_after_another(cell):
+    """The same outputs and gradients, with episodes that begin in the middle of a rollout."""
+    options = dataclasses.replace(GRU, cell=cell)
+    network = networks.recurrent(options, jnp.zeros(2), 1)
+    params, one = network.init(jax.random.key(0))
+    rng = np.random.default_rng(1)
+    memory = jax.tree.map(lambda x: rng.normal(size=(4, *x.shape)).astype(np.float32), one)
+    seen, begins = rng.normal(size=(7, 4, 2)).astype(np.float32), rng.uniform(size=(7, 4)) < 0.3
+    batch = SimpleNamespace(observation=seen, is_first=begins, drawn=())
+
+    def learned(network):
+        def total(params):
+            output = learner.unroll(network, params, batch, memory)
+            return sum(jnp.sin(x).sum() for x in jax.tree.leaves(output)), output
+
+        return jax.value_and_grad(total, has_aux=True)(params)
+
+    assert network.sequences and begins[1:].any()
+    one_by_one = jax.tree.leaves(learned(network._replace(sequences=False)))
+    for a, b in zip(jax.tree.leaves(learned(network)), one_by_one, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize("recurrent", [False, True])
 def test_a_start_that_is_no_number_costs_its_own_step_alone(recurrent):
     env, network, state = setup(env=BadStarts(), recurrent=recurrent)

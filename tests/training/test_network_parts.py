@@ -181,6 +181,8 @@ def test_a_part_of_another_run_needs_its_units():
     for wrong in ({"run": "runs/a"}, {"reads": ("policy",)}):
         with pytest.raises(ValueError, match="a part of another run needs both"):
             Part(**wrong)
+    with pytest.raises(ValueError, match=r"reads is 'policy'; give a tuple .*: \('policy',\)"):
+        Part(run="runs/a", reads="policy")
 
 
 def test_one_entry_has_the_units_of_one_run(old):
@@ -192,7 +194,7 @@ def test_one_entry_has_the_units_of_one_run(old):
         "params",
     }
     both["guess"] = Part(run=str(old), checkpoint="9", reads=("policy",))
-    with pytest.raises(UserError, match="parts.guess: normalizer/mean/.* is another in"):
+    with pytest.raises(UserError, match="parts.guess: its normalizer/mean/.* is not that of a"):
         taken_parts.read_parts(both, abstract)
 
 
@@ -223,11 +225,15 @@ def test_a_run_that_was_told_in_an_array_lends_its_units_to_a_dict(old):
     assert len(taken) == 4
     for key, x in taken.items():
         assert (x == saved(old)[key.replace("/policy", "")]).all(), key
-    with pytest.raises(
-        UserError, match=r"normalizer/mean/error is .* \[1\]\] in it and .* \[2\]\]"
-    ):
-        both = {"decoder": Part(run=str(old), reads=("policy", "more"))}
-        taken_parts.read_parts(both, dicts)
+    for reads, told in [
+        (("policy", "more"), r"policy, more, 2 numbers, .* of 1: .* There are: more \(1\), policy"),
+        (
+            ("more", "policy"),
+            "reads is more, policy: an array begins with what the policy may read",
+        ),
+    ]:
+        with pytest.raises(UserError, match=told):
+            taken_parts.read_parts({"decoder": Part(run=str(old), reads=reads)}, dicts)
 
 
 def test_a_rate_of_its_own_is_of_its_parameters_alone():
