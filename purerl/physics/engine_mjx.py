@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import io
+import os
 from typing import Any
 
 import jax
@@ -69,7 +70,9 @@ class JaxEngine:
         self._exact_step = exact.rewrite(self.plain_step, platform=platform)
         self.stepped_by: list[str] | None = None  # of `exact.with_kernel`
         if platform == "gpu" and self.data._impl.efc_J.size <= MOST_OF_A_KERNEL:
-            self._by_xla = jax.jit(jax.vmap(self._exact_step))
+            self._apart = _compares()
+            quickly = {"xla_backend_optimization_level": 0} if self._apart else None
+            self._by_xla = jax.jit(jax.vmap(self._exact_step), compiler_options=quickly)
             self.stepped_by = []
             self._exact_step = exact.with_kernel(
                 self.plain_step, self._exact_step, self._reached, self.stepped_by.append
@@ -129,12 +132,12 @@ class JaxEngine:
         )
         states.qvel[:] += 0.1 * rng.normal(size=states.qvel.shape)
         changes = {n: several(getattr(self.model, n), x) for n, x in changes.items()}
-        with mjx_defaults():
+        with mjx_defaults(), jax.default_device(self._apart):
             for _ in range(TRIED_FOR):
                 ctrls = rng.uniform(-1, 1, (TRIED, *ctrl.shape)).astype(np.float32)
                 args = states, ctrls, changes
                 states, readings = self._by_xla(*args)
-        return args, (states, readings)
+        return jax.tree.map(np.asarray, (args, (states, readings)))
 
     def _changed(self, changes: dict[str, Array]) -> mjx.Model:
         """Returns the model with changes; MJX's matrices (`cam_mat0`) are [n, 3, 3]."""
@@ -144,6 +147,17 @@ class JaxEngine:
     def _read(self, data: mjx.Data) -> tuple:
         read = [jnp.reshape(_field_of(data, n), shape) for n, shape in self.shapes.items()]
         return self.record(*(x.astype(jnp.float32) for x in read))
+
+
+def _compares() -> jax.Device | None:
+    """Returns where a kernel's comparison is computed: a CPU, for which XLA compiles a step sooner.
+
+    None, the first device, if JAX has no CPU, or two threads there, on which MJX may stop for ever.
+    """
+    enough = len(os.sched_getaffinity(0)) > 2 and not os.environ.get("NPROC")
+    with contextlib.suppress(RuntimeError):
+        return jax.local_devices(backend="cpu")[0] if enough else None
+    return None
 
 
 def _hint(model: mujoco.MjModel) -> str:

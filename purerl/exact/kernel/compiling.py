@@ -104,9 +104,8 @@ def _written(closed: core.ClosedJaxpr, meanwhile: Callable[[], Any]) -> text.Tex
         numbers.update(f"{x.dtype}{x.shape}".encode() + x.tobytes())
 
     def make(_: str) -> bytes:
-        program = reading.read(closed)
         meanwhile()
-        return json.dumps(text.written(program)).encode()
+        return json.dumps(text.written(reading.read(closed))).encode()
 
     path = compilers.kept(str(closed), (numbers.hexdigest(),), "text.json", make)
     *found, inputs, outputs = json.loads(path.read_text())

@@ -1,6 +1,7 @@
 """Which of a function's two programs is run: one kernel, or XLA's. 20 s."""
 
 import json
+import os
 import re
 from functools import partial
 
@@ -94,7 +95,12 @@ def test_xla_computes_what_no_kernel_can_and_says_why(function, why):
 
 @needs_compiler
 @pytest.mark.usefixtures("compiled_quickly")
-def test_a_gpus_engine_steps_by_a_kernel_what_is_small(monkeypatch):
+@pytest.mark.parametrize("cores", [2, 4])
+def test_a_gpus_engine_steps_by_a_kernel_what_is_small(monkeypatch, cores):
+    """With four cores it is compared with XLA on a CPU, whatever computes."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {*range(cores)})
+    monkeypatch.delenv("NPROC", raising=False)
+    assert (engine_mjx._compares() is None) == (cores == 2)
     physics = Physics(mujoco.MjModel.from_xml_string(PENDULUM), ("xpos",), 3, "jax")
     make = partial(engine_mjx.JaxEngine, physics.model, physics._engine.record, (), 3)
     engine = make(platform="gpu")
@@ -112,6 +118,15 @@ def test_a_gpus_engine_steps_by_a_kernel_what_is_small(monkeypatch):
     assert len(set(np.ravel(results[0][0].qvel).tolist())) == 3, "each has a mass of its own"
     monkeypatch.setattr(engine_mjx, "MOST_OF_A_KERNEL", -1)
     assert make(platform="gpu").stepped_by is None
+
+
+def test_where_jax_has_no_cpu_a_kernel_is_compared_where_it_runs(monkeypatch):
+    def none(backend):
+        raise RuntimeError("Unknown backend cpu")
+
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {*range(4)})
+    monkeypatch.setattr(jax, "local_devices", none)
+    assert engine_mjx._compares() is None
 
 
 @needs_compiler
