@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import io
-import os
 from typing import Any
 
 import jax
@@ -13,6 +12,7 @@ import numpy as np
 
 from purerl import exact
 from purerl.core.records import Array, PyTree
+from purerl.physics.host_calls import usable_cores
 from purerl.physics.lookup import reading_shapes
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that warp, which is optional, is absent
@@ -154,9 +154,8 @@ def _compares() -> jax.Device | None:
 
     None, the first device, if JAX has no CPU, or two threads there, on which MJX may stop for ever.
     """
-    enough = len(os.sched_getaffinity(0)) > 2 and not os.environ.get("NPROC")
     with contextlib.suppress(RuntimeError):
-        return jax.local_devices(backend="cpu")[0] if enough else None
+        return jax.local_devices(backend="cpu")[0] if usable_cores() > 2 else None
     return None
 
 

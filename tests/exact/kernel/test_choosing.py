@@ -1,7 +1,6 @@
 """Which of a function's two programs is run: one kernel, or XLA's. 20 s."""
 
 import json
-import os
 import re
 from functools import partial
 
@@ -98,8 +97,7 @@ def test_xla_computes_what_no_kernel_can_and_says_why(function, why):
 @pytest.mark.parametrize("cores", [2, 4])
 def test_a_gpus_engine_steps_by_a_kernel_what_is_small(monkeypatch, cores):
     """With four cores it is compared with XLA on a CPU, whatever computes."""
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {*range(cores)})
-    monkeypatch.delenv("NPROC", raising=False)
+    monkeypatch.setattr(engine_mjx, "usable_cores", lambda: cores)
     assert (engine_mjx._compares() is None) == (cores == 2)
     physics = Physics(mujoco.MjModel.from_xml_string(PENDULUM), ("xpos",), 3, "jax")
     make = partial(engine_mjx.JaxEngine, physics.model, physics._engine.record, (), 3)
@@ -124,7 +122,7 @@ def test_where_jax_has_no_cpu_a_kernel_is_compared_where_it_runs(monkeypatch):
     def none(backend):
         raise RuntimeError("Unknown backend cpu")
 
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {*range(4)})
+    monkeypatch.setattr(engine_mjx, "usable_cores", lambda: 4)
     monkeypatch.setattr(jax, "local_devices", none)
     assert engine_mjx._compares() is None
 
