@@ -242,6 +242,7 @@ def reuse(build: Callable[[Any, PyTree, int], Network]) -> Callable[..., Network
             policy, losses = answer
             return PolicyOutput(policy, output.value, losses | output.losses), memory
 
+        vars(apply)["sequences"] = getattr(task.apply, "sequences", False)
         return task._replace(init=init, apply=apply)
 
     return built

@@ -64,9 +64,11 @@ class Network(NamedTuple):
     without it, and answers by the mean too.
     `scale(directions)`: what the rate multiplies, of Adam's directions of `params`.
     `hold(old, new)`: the statistics of observations, of those before an update and after it.
-    `sequences`: whether `apply` takes T steps at once too, if it is given `is_first` [T, M], where
-    an episode begins. Leaves are [T, M, ...] then, and `memory` is that before the first step. All
-    that needs no memory is computed for all steps together, which is what a GPU is good at.
+
+    An `apply` with an attribute `sequences` that is true takes T steps at once too, if it is given
+    `is_first` [T, M], where an episode begins. Leaves are [T, M, ...] then, and `memory` is that
+    before the first step. All that needs no memory is computed for all steps together. (It is no
+    field here: another `apply`, put in this one's place, may not be able to.)
     """
 
     init: Callable[[Array], tuple[PyTree, PyTree]]
@@ -74,7 +76,6 @@ class Network(NamedTuple):
     draw: Callable[[Array], PyTree] | None = None
     scale: Callable[[PyTree], PyTree] = lambda directions: directions
     hold: Callable[[PyTree, PyTree], PyTree] = lambda old, new: new
-    sequences: bool = False
 
 
 class Counter(struct.PyTreeNode):

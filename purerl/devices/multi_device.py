@@ -222,8 +222,7 @@ def compile_collects(
     places = resized({name: getattr(abstract, name) for name in PLACES}, layout.size)
 
     def build(device: Any) -> Any:
-        here = SingleDeviceSharding(device)
-        return compiled(program.lower(*shapes((learned, places), here)))
+        return compiled(program.lower(*shapes((learned, places), SingleDeviceSharding(device))))
 
     (device, _), *others = layout.here
     # The first alone: where the persistent cache serves all devices, the others find it there.

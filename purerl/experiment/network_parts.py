@@ -71,6 +71,7 @@ def with_parts(
         moving = map_named(lambda path, x: x if rate(path) else stop(x), params)
         return network.apply(moving, *given, **more)
 
+    vars(apply)["sequences"] = getattr(network.apply, "sequences", False)
     held = tuple(entry for part in parts.values() for entry in part.reads or ())
     scale = partial(map_named, lambda path, x: rate(path) * x)
     hold = partial(map_named, lambda path, old, new: old if is_held(path, held) else new)

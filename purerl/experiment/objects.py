@@ -237,6 +237,7 @@ def in_float32(network: Network) -> Network:
         output, memory = network.apply(params, *given, **more)
         return jax.tree.map(lambda x: x.astype(jnp.float32), output), memory
 
+    vars(apply)["sequences"] = getattr(network.apply, "sequences", False)
     return network._replace(apply=apply)
 
 

@@ -70,7 +70,7 @@ class JaxEngine:
         self._exact_step = exact.rewrite(self.plain_step, platform=platform)
         self.stepped_by: list[str] | None = None  # of `exact.with_kernel`
         if platform == "gpu" and self.data._impl.efc_J.size <= MOST_OF_A_KERNEL:
-            self._apart = _compares()
+            self._apart = _to_compare_on()
             quickly = {"xla_backend_optimization_level": 0} if self._apart else None
             self._by_xla = jax.jit(jax.vmap(self._exact_step), compiler_options=quickly)
             self.stepped_by = []
@@ -149,7 +149,7 @@ class JaxEngine:
         return self.record(*(x.astype(jnp.float32) for x in read))
 
 
-def _compares() -> jax.Device | None:
+def _to_compare_on() -> jax.Device | None:
     """Returns where a kernel's comparison is computed: a CPU, for which XLA compiles a step sooner.
 
     None, the first device, if JAX has no CPU, or two threads there, on which MJX may stop for ever.

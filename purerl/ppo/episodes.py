@@ -57,6 +57,11 @@ def start_memory(memory: PyTree, num_episodes: int) -> PyTree:
     return jax.tree.map(lambda x: jnp.zeros((num_episodes, *x.shape[1:]), x.dtype), memory)
 
 
+def restarted(memory: PyTree, begins: Array) -> PyTree:
+    """Returns a memory [B, H] that starts from zero where an episode begins, `begins` [B] bool."""
+    return select(begins, jax.tree.map(jnp.zeros_like, memory), memory)
+
+
 def draw(network: Network, key: Array, env_ids: Array, *indices: Array) -> tuple:
     """Returns the network's own noise as what `act` takes: (noise [B, ...],), or () if it has none.
 

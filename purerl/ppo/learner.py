@@ -160,7 +160,7 @@ def unroll(network: Network, params: PyTree, batch: Batch, memory: PyTree) -> Po
     Returns:
       Gaussians and values, [T', M, ...].
     """
-    more = {"is_first": batch.is_first} if network.sequences else {}
+    more = {"is_first": batch.is_first} if getattr(network.apply, "sequences", False) else {}
     if more or not is_recurrent(memory):
         return network.apply(params, batch.observation, memory, *batch.drawn, **more)[0]
 
@@ -168,7 +168,7 @@ def unroll(network: Network, params: PyTree, batch: Batch, memory: PyTree) -> Po
     # memory at that step is data, and of older parameters.
     def step(memory: PyTree, row: tuple[PyTree, Array, tuple]) -> tuple[PyTree, PolicyOutput]:
         observation, is_first, drawn = row
-        fresh = episodes.select(is_first, jax.tree.map(jnp.zeros_like, memory), memory)
+        fresh = episodes.restarted(memory, is_first)
         output, memory = network.apply(params, observation, fresh, *drawn)
         return memory, output
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 
 from purerl.core.records import Array, Network, Normal, PolicyOutput, PyTree
 from purerl.ppo.checks import check_observation
+from purerl.ppo.episodes import restarted
 
 
 @dataclass(frozen=True)
@@ -146,8 +147,7 @@ def remember(cell: Any, memory: PyTree, seen: Array, is_first: Array | None) -> 
         return cell(memory, seen)
 
     def step(cell: Any, memory: PyTree, row: tuple[Array, Array]) -> tuple:
-        fresh = jax.tree.map(lambda x: jnp.where(row[1][:, None], 0.0, x), memory)
-        return cell(fresh, row[0])
+        return cell(restarted(memory, row[1]), row[0])
 
     steps = nn.scan(step, variable_broadcast="params", split_rngs={"params": False})
     return steps(cell, memory, (seen, is_first))
@@ -216,7 +216,8 @@ def from_linen(module: nn.Module, observation: PyTree, memory: PyTree = ()) -> N
         output: Any = module.apply(params | stay, observation, *more, **at)
         return output if recurrent else (output, memory)
 
-    return Network(init=init, apply=apply, sequences=sequences)
+    vars(apply)["sequences"] = sequences
+    return Network(init=init, apply=apply)
 
 
 def mlp(options: MlpOptions, observation: PyTree, action_size: int) -> Network:

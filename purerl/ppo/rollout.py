@@ -165,7 +165,7 @@ def _step(
     # Everything above is of the episode that the step belongs to; from here on, of the next one.
     following = RolloutState(
         env_state=episodes.select(done, fresh, env_state),
-        memory=jax.tree.map(lambda x: episodes.select(done, jnp.zeros_like(x), x), memory),
+        memory=episodes.restarted(memory, done),
         episode=episodes.select(
             done,
             episodes.start_episodes(fresh, episodes.time_limits(config, state.env_ids)),

@@ -296,7 +296,6 @@ def _contacts(model, data, qpos) -> int:
     return data.ncon
 
 
-@pytest.mark.slow
 def test_a_cheetah_falls_by_the_steps_that_it_runs_by():
     """One kernel of 200 steps is too far from XLA's: starts took five sixths of a training."""
     env = ours("cheetah-run", "jax")
@@ -304,6 +303,7 @@ def test_a_cheetah_falls_by_the_steps_that_it_runs_by():
     assert ours("cheetah-run").domain.settling.substeps == cheetah.SETTLING
 
 
+@pytest.mark.slow
 def test_random_joints_have_their_ranges():
     """Against dm_control's own draw, joint by joint: the same least and greatest."""
     for name in ("walker-stand", "humanoid-stand", "hopper-hop"):

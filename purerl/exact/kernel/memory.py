@@ -4,8 +4,6 @@ Memory of values that are never needed at once is shared. Shared memory of a GPU
 many environments a multiprocessor steps side by side.
 """
 
-import collections
-import itertools
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -93,8 +91,9 @@ def placed(scheduler: Scheduler, inputs: Sequence[Held]) -> tuple[dict[Value, in
         clock.write([one])
     clock.run(scheduler.plan)
     spans, slots = clock.spans(), len(scheduler.slots)
-    size, places = _first_fit(spans, next(orders := _orders(spans)), slots)
-    while size > slots + _needed_at_once(spans) and (order := next(orders, None)) is not None:
+    least, orders = slots + _needed_at_once(spans), _orders(spans)
+    size, places = _first_fit(spans, next(orders), slots)
+    while size > least and (order := next(orders, None)) is not None:
         size, places = min((size, places), _first_fit(spans, order, slots), key=lambda x: x[0])
     address: dict[Value, int] = {SLOTS: 0}
     for span, place in zip(spans, places, strict=True):
@@ -106,11 +105,9 @@ def placed(scheduler: Scheduler, inputs: Sequence[Held]) -> tuple[dict[Value, in
 
 def _needed_at_once(spans: Sequence[_Span]) -> int:
     """Returns how many numbers are needed at once, at most: no order needs less memory."""
-    change = collections.Counter[int]()
-    for span in spans:
-        change[span.first] += span.size
-        change[span.last + 1] -= span.size
-    return max(itertools.accumulate(change[time] for time in sorted(change)), default=0)
+    begins = {span.first for span in spans}  # it is most when one has just begun
+    needed = (sum(x.size for x in spans if x.first <= now <= x.last) for now in begins)
+    return max(needed, default=0)
 
 
 def _orders(spans: Sequence[_Span]) -> Iterator[np.ndarray]:

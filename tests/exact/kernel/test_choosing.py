@@ -98,7 +98,7 @@ def test_xla_computes_what_no_kernel_can_and_says_why(function, why):
 def test_a_gpus_engine_steps_by_a_kernel_what_is_small(monkeypatch, cores):
     """With four cores it is compared with XLA on a CPU, whatever computes."""
     monkeypatch.setattr(engine_mjx, "usable_cores", lambda: cores)
-    assert (engine_mjx._compares() is None) == (cores == 2)
+    assert (engine_mjx._to_compare_on() is None) == (cores == 2)
     physics = Physics(mujoco.MjModel.from_xml_string(PENDULUM), ("xpos",), 3, "jax")
     make = partial(engine_mjx.JaxEngine, physics.model, physics._engine.record, (), 3)
     engine = make(platform="gpu")
@@ -124,7 +124,7 @@ def test_where_jax_has_no_cpu_a_kernel_is_compared_where_it_runs(monkeypatch):
 
     monkeypatch.setattr(engine_mjx, "usable_cores", lambda: 4)
     monkeypatch.setattr(jax, "local_devices", none)
-    assert engine_mjx._compares() is None
+    assert engine_mjx._to_compare_on() is None
 
 
 @needs_compiler
