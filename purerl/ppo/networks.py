@@ -131,9 +131,7 @@ class MlpActorCritic(nn.Module):
         return PolicyOutput(normal, nn.Dense(1, name="value_out")(value)[..., 0])
 
 
-def remember(
-    cell: nn.RNNCellBase, memory: PyTree, seen: Array, is_first: Array | None
-) -> tuple[PyTree, Array]:
+def remember(cell: nn.RNNCellBase, memory: PyTree, seen: Array, is_first: Array | None) -> tuple:
     """Moves a memory on by what is seen in one step, or in T of them, of M environments.
 
     Args:
@@ -162,9 +160,7 @@ class RecurrentActorCritic(nn.Module):
     action_size: int
 
     @nn.compact
-    def __call__(
-        self, observation: PyTree, memory: PyTree, *, is_first: Array | None = None
-    ) -> tuple[PolicyOutput, PyTree]:
+    def __call__(self, observation: PyTree, memory: PyTree, is_first: Array | None = None) -> tuple:
         """Moves the memory on by one observation, or by T of them, and answers from it.
 
         Args:
