@@ -160,7 +160,7 @@ class RecurrentActorCritic(nn.Module):
     action_size: int
 
     @nn.compact
-    def __call__(self, observation: PyTree, memory: PyTree, is_first: Array | None = None) -> tuple:
+    def __call__(self, observation: PyTree, memory: PyTree, *, is_first: PyTree = None) -> tuple:
         """Moves the memory on by one observation, or by T of them, and answers from it.
 
         Args:
