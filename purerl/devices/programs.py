@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from purerl.core.env import Env
 from purerl.core.keys import Purpose, derive
@@ -72,6 +73,8 @@ def compile_programs(
     policy: Any = functools.partial(policy_of, network)
     key = jax.random.key(0)
     if vmapped_seeds > 1:
+        one_by_one = network._replace(init=in_turn(network.init))
+        init = functools.partial(algorithm.init, config, env, one_by_one)
         init, judge, policy = jax.vmap(init), jax.vmap(judge), jax.vmap(policy)
         key = jax.random.split(key, vmapped_seeds)
     with compilation.no_collection():
@@ -99,6 +102,22 @@ def compile_programs(
         fetch=compiling.fetch,
         policy=jax.jit(policy),
     )
+
+
+def in_turn(init: Callable[[Array], PyTree]) -> Callable[[Array], PyTree]:
+    """Returns a function that is computed for each key by itself under vmap, as without it.
+
+    A cell begins with orthogonal matrices. jaxlib factorises a batch of them in parts, and two such
+    factorisations on two threads wait for each other for ever: see `threads`.
+    """
+    alone = jax.custom_batching.custom_vmap(init)
+
+    @alone.def_vmap
+    def _(size: int, _: Any, keys: Array) -> tuple[PyTree, PyTree]:
+        made = jax.tree.map(lambda *x: jnp.stack(x), *[init(keys[i]) for i in range(size)])
+        return made, jax.tree.map(lambda _: True, made)
+
+    return alone
 
 
 def evaluate_in_run(

@@ -2,7 +2,8 @@
 
 jaxlib's factorisation of a batch waits, on one of XLA's threads, for parts that it gives to the
 others. MJX has two that do not depend on each other: begun at once on two threads, each waits for
-the other for ever (docs/explanation/engines.md). One thread waits for nobody.
+the other for ever (docs/explanation/engines.md). One thread waits for nobody. What vmapped seeds
+begin with is made for one after another, for the same reason (`programs.in_turn`).
 """
 
 import os

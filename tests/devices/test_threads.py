@@ -81,3 +81,31 @@ def test_the_command_has_one_thread_before_jax_begins(tmp_path):
     assert "Done: 16,384 steps" in done.stdout and "stop for ever" not in done.stdout
     manifest = json.loads((tmp_path / "ant_run" / "one" / "manifest.json").read_text())
     assert manifest["device"]["threads"] == 1
+
+
+FOUR_SEEDS = """
+import functools
+import jax, jax.numpy as jnp
+from purerl import Config, networks
+from purerl.devices.programs import in_turn
+from purerl.envs import cartpole_swingup
+from purerl.ppo import algorithm
+
+env = cartpole_swingup.build(engine="c")
+given = jax.eval_shape(env.reset, jax.random.key(0)).observation
+network = networks.recurrent(networks.RecurrentOptions(), jnp.zeros(given.shape), 1)
+network = network._replace(init=in_turn(network.init))
+init = functools.partial(algorithm.init, Config(num_steps=8192), env, network)
+for number in range(3):
+    keys = jax.random.split(jax.random.key(number), 4)
+    jax.block_until_ready(jax.jit(jax.vmap(init))(keys))
+"""
+
+
+@pytest.mark.slow
+def test_vmapped_seeds_of_a_cell_begin_on_two_threads():
+    """12 s. With the network's `init` as it is, the first never ended."""
+    environment = os.environ | {"NPROC": "2", "JAX_PLATFORMS": "cpu"}
+    subprocess.run(
+        [sys.executable, "-c", FOUR_SEEDS], env=environment, cwd=ROOT, timeout=120, check=True
+    )
