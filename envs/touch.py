@@ -18,7 +18,7 @@ def touched(
 
     Args:
       model: as it was compiled.
-      geoms: ids of ellipsoids, G of them: what touches.
+      geoms: ids of ellipsoids or of capsules, G of them: what touches.
       readings: with `xpos` and `xmat`.
       balls: their middles [M, 3] [m].
       radius: of each [m].
@@ -29,7 +29,8 @@ def touched(
     inner = balls[:, None] - readings.xpos[body]  # [M, G, 3]
     inner = (inner[..., None] * readings.xmat[body]).sum(-2) - model.geom_pos[ids]
     own = (inner[..., None] * turn).sum(-2)
-    away = jax.vmap(jax.vmap(distance_to_ellipsoid), (0, None))(own, model.geom_size[ids])
+    (kind,) = {int(x) for x in model.geom_type[ids]}
+    away = jax.vmap(jax.vmap(DISTANCES[kind]), (0, None))(own, model.geom_size[ids])
     return (away < radius).any(1)
 
 
@@ -54,3 +55,21 @@ def distance_to_ellipsoid(point: Array, radii: Any) -> Array:
     low, _ = jax.lax.fori_loop(0, 40, halve, (jnp.zeros(()), most))
     nearest = point * square / (square + low)
     return jnp.where(outside(jnp.zeros(())), jnp.sqrt(jnp.square(point - nearest).sum()), 0.0)
+
+
+def distance_to_capsule(point: Array, size: Any) -> Array:
+    """Returns the distance of a point [3] from a capsule along z, [], 0 inside [m].
+
+    Args:
+      point: in its frame.
+      size: its radius, and half the length between the middles of its ends.
+    """
+    axis = jnp.clip(point[2], -size[1], size[1])
+    return jnp.maximum(jnp.sqrt(jnp.square(point.at[2].add(-axis)).sum()) - size[0], 0.0)
+
+
+_GEOM = mujoco.mjtGeom
+DISTANCES = {
+    int(_GEOM.mjGEOM_ELLIPSOID): distance_to_ellipsoid,
+    int(_GEOM.mjGEOM_CAPSULE): distance_to_capsule,
+}

@@ -1,38 +1,62 @@
-"""dm_control's two-touch: a rodent taps an orb, waits 0.8 s, and taps it again.
+"""dm_control's two-touch: a body taps an orb, waits 0.8 s, and taps it again.
 
 What is right depends on when the first tap was, which nothing tells: the task needs a memory. The
 orb, its place, its state and its clock are data of the episode; after both taps it is elsewhere.
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-import mujoco
 
 from purerl import Array, Physics, PhysicsState, State, eyes as seeing, lookup
 from purerl.envs import sight
 from purerl.envs.arenas import TARGET, Floor
-from purerl.envs.bodies import RODENT
+from purerl.envs.bodies import ANT, RODENT, Body
 from purerl.envs.compose import PREFIX, Composed, compose
 from purerl.envs.feeling import READINGS, felt
 from purerl.envs.touch import touched
 
 BEFORE, ONCE, TWICE, TOO_SOON, TOO_LATE = range(5)
-HEIGHT, AREA, RADIUS = 0.14, 1.5, 0.025  # of the orb: above the ground, +- from the middle [m]
+HEIGHT, AREA = 0.14, 1.5  # of the orb: above the ground, +- from the middle [m]
 REWARD, NEAR = 25.0, 0.01  # for each right tap; the share of it that being near earns in a step
 INTERVAL, TOLERANCE, DEBOUNCE, TIMEOUT = 0.8, 0.1, 0.2, 1.2  # [s]
+
+
+@dataclasses.dataclass(frozen=True)
+class Touching:
+    """What of a body touches, by names without the prefix that composing gives them."""
+
+    body: Body
+    hands: tuple[str, ...]  # bodies: how near the nearest is is rewarded
+    palms: tuple[str, ...]  # geoms, ellipsoids or capsules: what touches
+    radius: float  # of the orb [m]
+
+
+_FEET = ANT.end_effectors
+TOUCHING = {
+    "ant": Touching(ANT, _FEET, tuple(f.replace("foot", "ankle_geom") for f in _FEET), 0.1),
+    "rodent": Touching(
+        RODENT, ("hand_L", "hand_R"), ("hand_L_collision", "hand_R_collision"), 0.025
+    ),
+}
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
     """Settings of the task."""
 
+    body: Literal["ant", "rodent"] = "rodent"
+    """The body. dm_control has this task for the rodent; an ant taps with the lower legs."""
     eyes: sight.Sight = sight.Sight(number=1)
     """Without eyes it is told where the orb is."""
     area: float = AREA
     """The orb is within +- this of where the body starts, along x and y [m]."""
+    tolerance: float = TOLERANCE
+    """A second tap is right so much sooner or later than 0.8 s after the first [s]."""
+    soon_cost: float = 0.0
+    """Taken from the reward by a second tap that is too soon; else a hand stays at the orb."""
     substeps: int = 5
     """Physics steps in one control step."""
 
@@ -45,7 +69,8 @@ class TwoTouch:
     physics: Physics
     parts: Composed
     hands: tuple[int, ...]  # body ids
-    palms: tuple[int, ...]  # geom ids, ellipsoids: what touches
+    palms: tuple[int, ...]  # geom ids: what touches
+    radius: float  # of the orb [m]
     action_size: int
     eyes: seeing.Eyes | None
 
@@ -66,8 +91,7 @@ class TwoTouch:
         orb = lookup.find(self.physics.model, "body", TARGET)
         changes = {"body_pos": place.at[orb].set(task["orb"]["place"])}
         physics, readings = self.physics.init(qpos, jnp.zeros(self.physics.model.nv), changes)
-        action = jnp.zeros(self.action_size)
-        return self._state(physics, readings, task, jnp.zeros(()), action)
+        return self._state(physics, readings, task, jnp.zeros(()), jnp.zeros(self.action_size))
 
     def step(self, state: State, action: Array) -> State:
         """Drives the actuators with action [A] in [-1, 1]."""
@@ -79,10 +103,13 @@ class TwoTouch:
         ctrl = lookup.scale_action(self.physics.model, action)
         physics, readings = self.physics.step(before, ctrl)
         palms, place = self.palms, orb["place"]
-        (touching,) = touched(self.parts.looks, palms, readings, place[None], RADIUS)
-        orb, earned = tapped(orb, touching, physics.time)
-        task = task | {"key": next_key, "orb": orb}
-        return self._state(physics, readings, task, earned, action)
+        (touching,) = touched(self.parts.looks, palms, readings, place[None], self.radius)
+        after, earned = tapped(orb, touching, physics.time, self.options.tolerance)
+        task = task | {"key": next_key, "orb": after}
+        counted = outcomes(orb["logic"], after["logic"])
+        earned = earned - self.options.soon_cost * counted["taps_soon_count"]
+        new = self._state(physics, readings, task, earned, action)
+        return new.replace(metrics=new.metrics | counted)
 
     def _state(
         self, physics: PhysicsState, readings: Any, task: dict, earned: Array, action: Array
@@ -109,7 +136,7 @@ class TwoTouch:
             terminated=jnp.zeros((), bool),
             truncated=jnp.zeros((), bool),
             metrics={"reward_near": near, "reward_tap": earned, "distance": away.min(),
-                     "taps_count": (earned > 0).astype(jnp.float32)},
+                     **outcomes(logic, logic)},
             task=task,
         )  # fmt: skip
 
@@ -129,13 +156,16 @@ def new_orb(key: Array, area: float) -> dict[str, Array]:
     }
 
 
-def tapped(orb: dict[str, Array], touching: Array, time: Array) -> tuple[dict[str, Array], Array]:
+def tapped(
+    orb: dict[str, Array], touching: Array, time: Array, tolerance: float = TOLERANCE
+) -> tuple[dict[str, Array], Array]:
     """Moves an orb on by a control step, and returns the reward for taps, [].
 
     Args:
       orb: of `new_orb`.
       touching: [] bool: whether a palm touches it now.
       time: [] of the episode [s].
+      tolerance: how far from `INTERVAL` after the first tap the second is right [s].
     """
     once = orb["once"] | touching
     touched = jnp.where(touching & ~orb["once"], time, orb["touched"])
@@ -143,8 +173,8 @@ def tapped(orb: dict[str, Array], touching: Array, time: Array) -> tuple[dict[st
     begins = (orb["logic"] == BEFORE) & once
     waiting = orb["logic"] == ONCE
     since = time - orb["first"]
-    ends, late = waiting & twice & ~orb["twice"], waiting & (since > INTERVAL + TOLERANCE)
-    soon = ends & (since < INTERVAL - TOLERANCE)
+    ends, late = waiting & twice & ~orb["twice"], waiting & (since > INTERVAL + tolerance)
+    soon = ends & (since < INTERVAL - tolerance)
     right = ends & ~soon & ~late
     logic = jnp.where(begins, ONCE, orb["logic"])
     logic = jnp.where(ends, jnp.where(soon, TOO_SOON, TWICE), logic)
@@ -163,19 +193,26 @@ def tapped(orb: dict[str, Array], touching: Array, time: Array) -> tuple[dict[st
     return orb, REWARD * (begins | right).astype(jnp.float32)
 
 
+def outcomes(before: Array, after: Array) -> dict[str, Array]:
+    """Returns how many orbs were tapped a first time in a step, and how their second taps were."""
+    counted = {"first": ONCE, "right": TWICE, "soon": TOO_SOON, "late": TOO_LATE}
+    now = {name: (after == logic) & (before != logic) for name, logic in counted.items()}
+    return {f"taps_{name}_count": x.astype(jnp.float32) for name, x in now.items()}
+
+
 def build(options: Options = Options(), engine: str = "auto") -> TwoTouch:  # noqa: B008
     """Builds the environment on an engine of `purerl.physics.interface`."""
-    parts = compose(RODENT, Floor(orb=RADIUS), engine)
-    hands = [lookup.find(parts.model, "body", f"{PREFIX}hand_{side}") for side in "LR"]
-    palms = [lookup.find(parts.looks, "geom", f"{PREFIX}hand_{side}_collision") for side in "LR"]
-    assert (parts.looks.geom_type[palms] == mujoco.mjtGeom.mjGEOM_ELLIPSOID).all()
-    eye = seeing.of_camera(parts.looks, PREFIX + RODENT.camera)
+    chosen = TOUCHING[options.body]
+    body = chosen.body
+    parts = compose(body, Floor(orb=chosen.radius), engine)
+    eye = seeing.of_camera(parts.looks, PREFIX + body.camera)
     return TwoTouch(
         options=options,
         physics=Physics(parts.model, READINGS, options.substeps, engine),
         parts=parts,
-        hands=tuple(hands),
-        palms=tuple(palms),
+        hands=tuple(lookup.find(parts.model, "body", PREFIX + name) for name in chosen.hands),
+        palms=tuple(lookup.find(parts.looks, "geom", PREFIX + name) for name in chosen.palms),
+        radius=chosen.radius,
         action_size=parts.model.nu,
-        eyes=sight.build(parts.looks, eye, RODENT.eye_distance, options.eyes, ()),
+        eyes=sight.build(parts.looks, eye, body.eye_distance, options.eyes, ()),
     )

@@ -53,8 +53,8 @@ class MlpOptions(PolicyOptions):
 
 
 @dataclass(frozen=True)
-class RecurrentOptions(PolicyOptions):
-    """Sizes of the recurrent network."""
+class RecurrentOptions(MlpOptions):
+    """Sizes of the recurrent network: those of the default one, which reads a memory too."""
 
     cell: Literal["gru", "lstm"] = "gru"
     """Kind of recurrent cell."""
@@ -62,8 +62,6 @@ class RecurrentOptions(PolicyOptions):
     """Features of the cell's memory."""
     encoder: tuple[int, ...] = (128,)
     """Widths of the layers before the cell."""
-    value_hidden: tuple[int, ...] = (128,)
-    """Widths of the value function's hidden layers, after the cell."""
 
 
 def policy_features(observation: PyTree) -> Array:
@@ -154,14 +152,18 @@ def remember(cell: nn.RNNCellBase, memory: PyTree, seen: Array, is_first: Array 
 
 
 class RecurrentActorCritic(nn.Module):
-    """A cell over what the policy may read; the value also reads the rest of the observation."""
+    """The default network, which reads beside an observation what a cell remembers of the past.
+
+    What it sees now need not pass through the cell: an ant, which has to reach an orb, learned that
+    in half of the steps that a policy behind the cell took.
+    """
 
     options: RecurrentOptions
     action_size: int
 
     @nn.compact
     def __call__(self, observation: PyTree, memory: PyTree, *, is_first: PyTree = None) -> tuple:
-        """Moves the memory on by one observation, or by T of them, and answers from it.
+        """Moves the memory on by one observation, or by T of them, and answers from both.
 
         Args:
           observation: leaves [..., O].
@@ -172,14 +174,14 @@ class RecurrentActorCritic(nn.Module):
           The `PolicyOutput`, and the memory that follows.
         """
         o = self.options
-        encoded = Stack(o.encoder, o.activation, name="encoder")(policy_features(observation))
+        # Only what the policy may read: the memory is read by the policy.
+        told = policy_features(observation)
+        encoded = Stack(o.encoder, o.activation, name="encoder")(told)
         cell = {"gru": nn.GRUCell, "lstm": nn.OptimizedLSTMCell}[o.cell](o.hidden, name="cell")
         memory, remembered = remember(cell, memory, encoded, is_first)
-        normal = GaussianHead(o, self.action_size, name="head")(remembered)
-        # The value function sees what the policy may not, such as the state of the simulation.
-        features = jnp.concatenate([remembered, value_features(observation)], axis=-1)
-        value = Stack(o.value_hidden, o.activation, name="value")(features)
-        return PolicyOutput(normal, nn.Dense(1, name="value_out")(value)[..., 0]), memory
+        known = {"policy": jnp.concatenate([told, remembered], axis=-1)}
+        rest = observation if isinstance(observation, dict) else {}
+        return MlpActorCritic(o, self.action_size, name="mlp")(rest | known), memory
 
 
 def from_linen(module: nn.Module, observation: PyTree, memory: PyTree = ()) -> Network:

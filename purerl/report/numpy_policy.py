@@ -31,6 +31,11 @@ class Policy:
     def _dense(self, name, x):
         return x @ self.arrays[f"{name}/kernel"] + self.arrays.get(f"{name}/bias", 0)
 
+    def _layers(self, name, number, x):
+        for i in range(number):
+            x = ACTIVATIONS[str(self.arrays["activation"])](self._dense(f"{name}{i}", x))
+        return x
+
     def _gru(self, x):
         r, z = (sigmoid(self._dense(f"i{k}", x) + self._dense(f"h{k}", self.h)) for k in "rz")
         new = np.tanh(self._dense("in", x) + r * self._dense("hn", self.h))
@@ -63,12 +68,10 @@ class Policy:
         x = np.clip(x, -a["clip"], a["clip"])
         if a["encoders"]:
             x = np.concatenate([x, *self._see(np.asarray(parts["eyes"]))], -1)
-        for layer in range(a["layers"]):
-            x = ACTIVATIONS[str(a["activation"])](self._dense(f"layer{layer}", x))
         if a["cell"]:
-            getattr(self, f"_{a['cell']}")(x)
-            x = self.h
-        return np.tanh(self._dense("loc", x))
+            getattr(self, f"_{a['cell']}")(self._layers("before", a["before"], x))
+            x = np.concatenate([x, self.h], -1)
+        return np.tanh(self._dense("loc", self._layers("layer", a["layers"], x)))
 
     def control(self, observation):
         """Returns the action as MuJoCo's `data.ctrl`, [..., A], over each actuator's range."""

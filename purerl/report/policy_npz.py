@@ -29,8 +29,9 @@ def policy_arrays(run: Run) -> dict[str, Any]:
     """Returns all that the policy needs, by name.
 
     `mean`, `std` [O] and `clip` normalize; `layer0/kernel` [O, H], `layer0/bias` [H], ... are
-    `layers` many, each followed by `activation`; a `cell` ("", "gru" or "lstm") with `memory_size`
-    [1 number] has its gates by Flax's names (`ir/kernel`, ...); `loc` and tanh give the action.
+    `layers` many, each followed by `activation`; `loc` and tanh give the action. A `cell` ("",
+    "gru" or "lstm") with `memory_size` [1 number] has its gates by Flax's names (`ir/kernel`, ...)
+    and `before` layers before it; what it remembers is read beside the observation.
     `encoders` many look at pictures, in `windows` [L, 2] of a kernel and a stride: `eye0/Dense_0`.
     `control_range` [A, 2], where the environment has a model, is what -1 and 1 stand for.
     """
@@ -43,9 +44,12 @@ def policy_arrays(run: Run) -> dict[str, Any]:
     options, seeing = run.experiment.network, run.state.params["params"]
     params = seeing.get("network", seeing)  # behind the eyes
     cell = getattr(options, "cell", "")
-    layers = params.get("encoder" if cell else "policy", {})  # Flax has none of no layers
+    acting = params.get("mlp", params)  # beside a cell
+    layers = acting.get("policy", {})  # Flax has none of no layers
     dense = {f"layer{i}": layers[f"Dense_{i}"] for i in range(len(layers))}
-    dense |= params.get("cell", {}) | {"loc": params["head"]["loc"]}
+    before = params.get("encoder", {})
+    dense |= {f"before{i}": before[f"Dense_{i}"] for i in range(len(before))}
+    dense |= params.get("cell", {}) | {"loc": acting["head"]["loc"]}
     encoders = [x for name, x in sorted(seeing.items()) if name.startswith("Convolutions_")]
     windows: Any = np.transpose([options.eyes.kernels, options.eyes.strides]) if encoders else []
     for i, encoder in enumerate(encoders):
@@ -53,6 +57,7 @@ def policy_arrays(run: Run) -> dict[str, Any]:
     return _normalizer(run) | {
         "activation": options.activation,
         "layers": len(layers),
+        "before": len(before),
         "encoders": len(encoders),
         "windows": windows,
         "cell": cell,

@@ -1,5 +1,6 @@
 """Two-touch against dm_control's own logic, and what the eyes see of its orb."""
 
+import copy
 from types import SimpleNamespace
 
 import jax
@@ -11,8 +12,8 @@ from dm_control.locomotion.props.target_sphere import TargetSphereTwoTouch
 from dm_control.locomotion.tasks import reach
 
 from purerl.envs import sight, two_touch
-from purerl.envs.touch import distance_to_ellipsoid
-from purerl.envs.two_touch import new_orb, tapped
+from purerl.envs.touch import distance_to_ellipsoid, touched
+from purerl.envs.two_touch import new_orb, outcomes, tapped
 
 DT = 0.021  # no number of steps is 0.2, 0.7, 0.9 or 1.2 s: there rounding would decide
 
@@ -80,10 +81,15 @@ def test_taps_are_judged_as_in_dm_control(share):
 
 def test_a_second_tap_at_the_right_time_is_worth_as_much():
     orb, earned = new_orb(jax.random.key(0), 1.5), []
+    counted = {name: set() for name in ("first", "right", "soon", "late")}
     for number in range(1, 120):
-        orb, reward = tapped(orb, jnp.asarray(number in (5, 43)), jnp.float32(number * DT))
+        after, reward = tapped(orb, jnp.asarray(number in (5, 43)), jnp.float32(number * DT))
+        for name, now in outcomes(orb["logic"], after["logic"]).items():
+            counted[name.split("_")[1]] |= {number} if now else set()
+        orb = after
         earned.append(float(reward))
     assert earned[4] == earned[42] == 25.0 and sum(earned) == 50.0
+    assert counted == {"first": {5}, "right": {43}, "soon": set(), "late": set()}
     assert bool(orb["over"]) and int(orb["logic"]) == two_touch.TWICE
 
 
@@ -102,6 +108,37 @@ def test_distance_to_an_ellipsoid_is_mujocos():
         if right > 2e-4:  # where the middle of the sphere is inside, MuJoCo's is another measure
             assert abs(float(ours(jnp.float32(point), radii)) - right) < 1e-4
     assert float(ours(jnp.zeros(3), radii)) == 0.0
+
+
+@pytest.mark.parametrize("body", ["ant", "rodent"])
+def test_what_touches_an_orb_is_what_mujoco_says(body):
+    """2 s each: 200 places about the limbs, the body posed at random."""
+    made = two_touch.build(two_touch.Options(body=body, eyes=sight.Sight(number=0)), "c")
+    model, random = copy.copy(made.parts.looks), np.random.default_rng(1)
+    data = mujoco.MjData(model)
+    orb = model.geom("target").id
+
+    @jax.jit
+    def judge(xpos, xmat, place):
+        read = SimpleNamespace(xpos=xpos, xmat=xmat)
+        return touched(model, made.palms, read, place[None], made.radius)[0]
+
+    said, near = 0, 0.8 * (made.radius + model.geom_rbound[made.palms[0]])
+    for number in range(200):
+        if number % 20 == 0:
+            data.qpos[7:] = model.qpos0[7:] + random.normal(scale=0.3, size=model.nq - 7)
+        mujoco.mj_kinematics(model, data)
+        middle = data.geom_xpos[random.choice(made.palms)]
+        place = middle + random.uniform(-near, near, 3)
+        data.mocap_pos[0] = place
+        mujoco.mj_forward(model, data)
+        away = min(mujoco.mj_geomDistance(model, data, i, orb, 1.0, None) for i in made.palms)
+        if abs(away) > 1e-4:  # nearer, rounding decides
+            given = data.xpos, data.xmat.reshape(-1, 3, 3), place
+            told = judge(*map(jnp.float32, given))
+            assert bool(told) == (away < 0), (number, away)
+            said += bool(told)
+    assert 20 < said < 180
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +167,7 @@ def test_an_orb_before_the_eye_is_seen_and_a_palm_in_it_touches(env):
         task = state.task | {"orb": orb, "key": jax.random.key(len(pictures))}
         after = step(state.replace(task=task), jnp.zeros(made.action_size))
         pictures[name] = np.asarray(after.observation["eyes"], int)
-        assert (float(after.metrics["taps_count"]) == 1.0) == (name == "in the hand")
+        assert (float(after.metrics["taps_first_count"]) == 1.0) == (name == "in the hand")
         near = np.exp(-3 * np.abs(data.xpos[list(made.hands)] - place).sum(1).min())
         assert float(after.metrics["reward_near"]) == pytest.approx(0.25 * near, rel=0.2)
     # White, as large as its size at its distance says: some 3% of the picture.

@@ -8,7 +8,13 @@ experiment = Experiment(
     env=cartpole_swingup.Options(),
     build_network=networks.recurrent,
     network=networks.RecurrentOptions(
-        cell="lstm", hidden=16, encoder=(16,), value_hidden=(16,), initial_std=0.6, min_std=1e-3
+        cell="lstm",
+        hidden=16,
+        encoder=(16,),
+        policy_hidden=(16,),
+        value_hidden=(16,),
+        initial_std=0.6,
+        min_std=1e-3,
     ),
     ppo=Config.plain(
         num_steps=768,

@@ -60,6 +60,7 @@ experiment = Experiment(
         cell="gru",
         hidden=8,
         encoder=(8,),
+        policy_hidden=(8,),
         value_hidden=(8,),
         eyes=eyes.Encoder((4,), (4,), (4,), 8),
     ),
