@@ -1,4 +1,4 @@
-"""An ant taps an orb, waits 0.8 s, and taps it again: dm_control's two-touch, which has a rodent.
+"""An ant taps an orb, waits 0.8 s, and taps it again, as dm_control's rodent does.
 
 python -m purerl.run ant_two_touch
 
