@@ -19,5 +19,5 @@ experiment = dataclasses.replace(
     # Treats alone are too rare to learn to walk from.
     env=maze_forage.Options(eyes=sight.Sight(number=2), forward_weight=0.5),
     build_network=eyes.recurrent,
-    network=eyes.RecurrentOptions(**vars(blind.network)),
+    network=eyes.RecurrentOptions(**vars(blind.network), encoder=(256,)),
 )

@@ -122,7 +122,7 @@ def from_command_line(
         # all that the command line needs to know: an environment's options need no registration.
         fields = [(name, kinds[name], dataclasses.field(kw_only=True)) for name in values]
         both = dataclasses.make_dataclass("Settings", fields, bases=(base,), frozen=True)
-        both.__doc__ = summary(source.path) or f"Trains {source.name}."
+        both.__doc__ = summary(source.path) or f"Experiment {source.name}."
         parsed = parse(both, arguments, prog, both(**values, **more), config)
         overrides = {name: getattr(parsed, name) for name in values}
         options = {f.name: getattr(parsed, f.name) for f in dataclasses.fields(base)}
