@@ -1,7 +1,8 @@
 """dm_control's two-touch: a body taps an orb, waits 0.8 s, and taps it again.
 
-What is right depends on when the first tap was, which nothing tells: the task needs a memory. The
-orb, its place, its state and its clock are data of the episode; after both taps it is elsewhere.
+What is right depends on when the first tap was, which nothing tells: a policy needs a memory, or a
+body whose motion takes so long. The orb, its place, its state and its clock are data of the
+episode; after both taps it is elsewhere.
 """
 
 import dataclasses
@@ -91,7 +92,8 @@ class TwoTouch:
         orb = lookup.find(self.physics.model, "body", TARGET)
         changes = {"body_pos": place.at[orb].set(task["orb"]["place"])}
         physics, readings = self.physics.init(qpos, jnp.zeros(self.physics.model.nv), changes)
-        return self._state(physics, readings, task, jnp.zeros(()), jnp.zeros(self.action_size))
+        logic, action = task["orb"]["logic"], jnp.zeros(self.action_size)
+        return self._state(physics, readings, task, jnp.zeros(()), outcomes(logic, logic), action)
 
     def step(self, state: State, action: Array) -> State:
         """Drives the actuators with action [A] in [-1, 1]."""
@@ -108,11 +110,16 @@ class TwoTouch:
         task = task | {"key": next_key, "orb": after}
         counted = outcomes(orb["logic"], after["logic"])
         earned = earned - self.options.soon_cost * counted["taps_soon_count"]
-        new = self._state(physics, readings, task, earned, action)
-        return new.replace(metrics=new.metrics | counted)
+        return self._state(physics, readings, task, earned, counted, action)
 
     def _state(
-        self, physics: PhysicsState, readings: Any, task: dict, earned: Array, action: Array
+        self,
+        physics: PhysicsState,
+        readings: Any,
+        task: dict,
+        earned: Array,
+        counted: dict[str, Array],
+        action: Array,
     ) -> State:
         place, logic = task["orb"]["place"], task["orb"]["logic"]
         away = jnp.abs(readings.xpos[jnp.array(self.hands)] - place).sum(1)
@@ -135,8 +142,7 @@ class TwoTouch:
             reward=near + earned,
             terminated=jnp.zeros((), bool),
             truncated=jnp.zeros((), bool),
-            metrics={"reward_near": near, "reward_tap": earned, "distance": away.min(),
-                     **outcomes(logic, logic)},
+            metrics={"reward_near": near, "reward_tap": earned, "distance": away.min(), **counted},
             task=task,
         )  # fmt: skip
 

@@ -1,6 +1,5 @@
 """Two-touch against dm_control's own logic, and what the eyes see of its orb."""
 
-import copy
 from types import SimpleNamespace
 
 import jax
@@ -114,7 +113,7 @@ def test_distance_to_an_ellipsoid_is_mujocos():
 def test_what_touches_an_orb_is_what_mujoco_says(body):
     """2 s each: 200 places about the limbs, the body posed at random."""
     made = two_touch.build(two_touch.Options(body=body, eyes=sight.Sight(number=0)), "c")
-    model, random = copy.copy(made.parts.looks), np.random.default_rng(1)
+    model, random = made.parts.looks, np.random.default_rng(1)
     data = mujoco.MjData(model)
     orb = model.geom("target").id
 
