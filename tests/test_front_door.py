@@ -227,8 +227,8 @@ def test_the_list_of_experiments_is_what_a_newcomer_wants_to_see():
     names = [name for name, path in available().items() if path.parent == ROOT / "experiments"]
     assert names == [
         "cartpole_swingup", "ant_run", "ant_gaps", "ant_gaps_eyes", "ant_two_touch", "rodent_run",
-        "rodent_gaps", "rodent_gaps_eyes", "rodent_bowl", "rodent_maze", "rodent_two_touch",
-        "rodent_joystick",
+        "rodent_gaps", "rodent_gaps_eyes", "rodent_bowl", "rodent_maze", "rodent_maze_eyes",
+        "rodent_two_touch", "rodent_joystick",
         "ant_intention", "humanoid_imitation", "rodent_imitation", "rodent_intention",
         "ant_gaps_reuse", "rodent_gaps_reuse",
         "suite", "suite_gpu", "suite_humanoid", "custom_network",

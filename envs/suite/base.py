@@ -103,13 +103,21 @@ class SuiteEnv:
         )
 
 
-def load_model(physics: Any, xml: tuple[str, dict[str, bytes]], engine: str) -> mujoco.MjModel:
-    """Compiles a domain's own MJCF, given its dm_control Physics class, XML and assets."""
+def load_model(
+    physics: Any, xml: tuple[str, dict[str, bytes]], engine: str, iterations: int = 4
+) -> mujoco.MjModel:
+    """Compiles a domain's own MJCF, given its dm_control Physics class, XML and assets.
+
+    `iterations` bound Newton's method, with 8 steps of line search each, for MJX only. By XLA the
+    whole batch pays for each iteration that any environment needs, and the models ask for up to
+    200. C stops each simulation when it has converged.
+    """
     model = physics.from_xml_string(*xml).model.ptr
     disable_energy(model)
     mask_disabled_contacts(model)
     if choose_engine(engine) == "jax":
-        few_iterations(model)
+        model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+        model.opt.iterations, model.opt.ls_iterations = iterations, 8
     return model
 
 
@@ -126,15 +134,6 @@ def mask_disabled_contacts(model: mujoco.MjModel) -> None:
     without = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     if model.opt.disableflags & without:
         model.geom_contype[:] = model.geom_conaffinity[:] = 0
-
-
-def few_iterations(model: mujoco.MjModel) -> None:
-    """Bounds the solver at 4 iterations with 8 line-search steps each, for MJX only.
-
-    There the whole batch pays for each iteration that any environment needs, and the models ask
-    for up to 200. C keeps what the model says.
-    """
-    _limit_solver(model, 4, 8)
 
 
 def make_env(
@@ -285,13 +284,3 @@ def segment_distance(a: Array, u: Array, b: Array, v: Array) -> Array:
     s = jnp.clip((t * uv + r @ u) / (uu + tiny), -1.0, 1.0)
     apart = r + t[:, None] * v - s[:, None] * u
     return jnp.sqrt(jnp.min(jnp.sum(apart**2, axis=1)))
-
-
-def _limit_solver(model: mujoco.MjModel, iterations: int, line_search: int) -> None:
-    """Bounds Newton's iterations.
-
-    MJX runs each iteration in lockstep for the whole batch, so the slowest environment sets the
-    time of all; MuJoCo's C code stops each simulation when it has converged.
-    """
-    model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    model.opt.iterations, model.opt.ls_iterations = iterations, line_search

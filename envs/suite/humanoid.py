@@ -26,6 +26,8 @@ STAND_HEIGHT = 1.4  # of the head [m]
 LIMBS = ("left_hand", "left_foot", "right_hand", "right_foot")
 CANDIDATES = 16  # starting poses to draw, to have one in which nothing touches
 READINGS = ("xpos", "xmat", "sensordata")
+# In float32, 256 environments under random actions lost 15 of 76,800 states with 4.
+ITERATIONS = 8
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ class Humanoid:
 def build(options: Options = Options(), engine: str = "auto") -> SuiteEnv:  # noqa: B008
     """Builds the environment on an engine of `purerl.physics.interface`."""
     check_task(options.task, tuple(SPEEDS))
-    model = load_model(humanoid.Physics, humanoid.get_model_and_assets(), engine)
+    model = load_model(humanoid.Physics, humanoid.get_model_and_assets(), engine, ITERATIONS)
     domain = Humanoid(
         target_speed=SPEEDS[options.task],
         geoms=Physics(model, ("geom_xpos", "geom_xmat"), 1, engine),

@@ -107,6 +107,11 @@ def rollout(
     # step has kept V(s'_t). Where one terminated or was lost, `gae` does not read it.
     following = jnp.concatenate([transitions.value[1:], output.value[None]])
     following = jnp.where(transitions.truncated, transitions.next_value, following)
+    # A state that is lost in its next step is taught no value: what bootstrapped from it would rise
+    # for ever. So that step is left out: what follows the one before is a new episode's start.
+    then = jnp.concatenate([following[1:], following[-1:]])
+    lost_next = jnp.concatenate([~transitions.valid[1:], jnp.zeros_like(transitions.valid[:1])])
+    following = jnp.where(lost_next, then, following)
     return state, transitions._replace(next_value=following), end.sums
 
 
@@ -141,9 +146,7 @@ def _step(
     reward = jnp.where(lost, 0.0, env_state.reward)
     discounted_return = config.gamma * now.discounted_return + reward
     # No row of the batch may hold a NaN, not even one that does not count: gradients multiply by 0,
-    # and 0 times NaN is NaN. The
-    # observation before a lost step is one if a fresh start was. A value that is a number stays:
-    # the step before bootstraps from it.
+    # and 0 times NaN is NaN. The observation before a lost step is one if a fresh start was.
     seen = now.env_state.observation, raw, distributions.log_prob(distribution, raw)
     observation, raw, log_prob = episodes.select(lost, jax.tree.map(jnp.zeros_like, seen), seen)
     transition = Transition(

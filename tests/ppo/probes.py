@@ -108,3 +108,21 @@ REWARDS = {
     "memory": lambda cue, action: -jnp.square(action - 0.5 * cue),
 }
 CUED = ("observation", "both", "memory")
+
+
+@dataclass(frozen=True)
+class Burst:
+    """Six numbers that at some step begin to grow, by 30 in each, until their state is lost."""
+
+    control_timestep: float = 1.0
+    action_size: int = 1
+
+    def reset(self, key: Array) -> State:
+        when, values = jax.random.split(key)
+        task = {"left": jax.random.randint(when, (), 5, 60)}
+        return _state(jax.random.normal(values, (6,)), jnp.zeros(()), jnp.zeros((), bool), task)
+
+    def step(self, state: State, action: Array) -> State:
+        left, x = state.task["left"] - 1, state.observation
+        x = jnp.where(left < 0, 30.0 * x, 0.9 * x + 0.3 * jnp.sin(7.0 * x + action))
+        return _state(x, jnp.ones(()), jnp.zeros((), bool), {"left": left})

@@ -290,19 +290,20 @@ def test_a_start_that_is_no_number_costs_its_own_step_alone(recurrent):
 def test_a_blown_up_environment_is_contained():
     """Environment 3 goes NaN: counted, reset, not learned from; the others' bits are the same."""
     sound_env, network, state = setup()
-    # The last moves of environment 3 alone lead beyond the cliff.
-    x = state.env_state.physics["x"].at[3].set(40.0)
+    # The second move of environment 3 alone leads beyond the cliff.
+    x = state.env_state.physics["x"].at[3].set(-38.9)
     state = state.replace(env_state=state.env_state.replace(physics={"x": x}))
-    broken_env = Walk(cliff=39.5)
+    broken_env = Walk(cliff=38.5)
     after, sound, _ = ROLLOUT(CONFIG, sound_env, network, state)
     contained, lost, finished = ROLLOUT(CONFIG, broken_env, network, state)
     assert (~np.asarray(lost.valid)).sum(0).tolist()[3] >= 1
     assert (
         finished["nonfinite_resets"].sum() == (~lost.valid).sum() == finished["nonfinite_resets"][3]
     )
-    # A step before the first lost one bootstraps from the value of a state that was still sound.
+    # The first lost step is left out: what follows the one before is the start of a new episode.
     t = int(np.argmin(lost.valid[:, 3]))
-    assert lost.value[t, 3] == sound.value[t, 3] != 0
+    assert 0 < t < len(lost.valid) - 1 and lost.is_first[t + 1, 3]
+    assert lost.next_value[t - 1, 3] == lost.value[t + 1, 3] != sound.next_value[t - 1, 3]
     for a, b in zip(jax.tree.leaves(sound), jax.tree.leaves(lost), strict=True):
         others = [0, 1, 2, 4, 5]
         np.testing.assert_array_equal(np.asarray(a)[:, others], np.asarray(b)[:, others])

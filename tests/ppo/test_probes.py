@@ -17,7 +17,7 @@ from purerl.ppo import (
 )
 from purerl.ppo.episodes import act
 from tests import quick
-from tests.ppo.probes import Point, Probe
+from tests.ppo.probes import Burst, Point, Probe
 
 SMALL = networks.MlpOptions(policy_hidden=(32,), value_hidden=(32,))
 CONFIG = algorithm.Config.plain(
@@ -166,3 +166,12 @@ def test_recurrent_network_remembers_the_cue(cell):
 def test_feed_forward_network_cannot_remember_the_cue():
     # The best it can do is action 0, for a squared error of 0.25.
     assert memory_error(networks.mlp, SMALL) > 0.22
+
+
+def test_a_state_that_is_lost_next_teaches_no_value_without_end():
+    """10 s. What bootstrapped from such a state had a value loss of 600 here, later of 1e12."""
+    config = algorithm.Config(
+        num_steps=64 * 32 * 40, num_envs=64, rollout_length=32, num_minibatches=8
+    )
+    _, metrics = train(config, Burst(), networks.mlp(SMALL, jnp.zeros(6), 1))
+    assert metrics["nonfinite_resets"] > 30 and metrics["value_loss"] < 1.0
