@@ -1,4 +1,4 @@
-"""dm_control's rodent finds treats in a maze that differs in every episode, told where one is.
+"""dm_control's rodent finds treats in a new maze each episode, told where the nearest is.
 
 python -m purerl.run rodent_maze --engine warp --num-seeds 3
 

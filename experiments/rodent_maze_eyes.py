@@ -1,4 +1,4 @@
-"""dm_control's rodent finds treats in a maze by sight, in the manner of one that was told.
+"""dm_control's rodent finds treats in a maze by sight, as one moves that was told.
 
 python -m purerl.run rodent_maze_eyes --parts.policy.run RUN --parts.head.run RUN
 
