@@ -317,6 +317,16 @@ def test_a_blown_up_environment_is_contained():
         assert jnp.isfinite(leaf).all()
 
 
+def test_a_truncated_step_keeps_its_value_where_the_next_start_is_lost():
+    env, network, state = setup()
+    _, sound, _ = ROLLOUT(CONFIG, env, network, state)
+    _, lost, _ = ROLLOUT(CONFIG, BadStarts(), network, state)
+    first, columns = np.argmax(sound.truncated, 0), np.arange(6)
+    at = columns[sound.truncated[first, columns] & ~lost.valid[first + 1, columns]]
+    assert len(at)
+    np.testing.assert_array_equal(lost.next_value[first[at], at], sound.next_value[first[at], at])
+
+
 def test_a_lost_sample_has_no_weight_in_the_update():
     """Whatever stands in the lost rows, the gradient is the same."""
     env, network, state = setup()
