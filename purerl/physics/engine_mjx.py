@@ -14,8 +14,9 @@ from purerl import exact
 from purerl.core.records import Array, PyTree
 from purerl.physics.host_calls import usable_cores
 from purerl.physics.lookup import reading_shapes
+from purerl.physics.mjx_alone import without_warp
 
-with contextlib.redirect_stdout(io.StringIO()):  # it prints that warp, which is optional, is absent
+with without_warp(), contextlib.redirect_stdout(io.StringIO()):  # MJX prints that it is absent
     from mujoco import mjx
     from mujoco.mjx._src import forward, sensor, smooth, solver
 

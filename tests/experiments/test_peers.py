@@ -108,6 +108,7 @@ def test_both_trainers_learn_with_equal_sizes():
     assert number == sum(p.numel() for p in model.policy.parameters())
 
 
+@pytest.mark.nightly
 def test_braxs_environment_keeps_to_the_protocol_and_steps_as_braxs():
     """Its states through our record and back are the states that brax steps through itself."""
     pytest.importorskip("brax", reason="needs the extra peers")
@@ -139,7 +140,7 @@ def test_braxs_settings_make_the_same_update(body):
     assert minibatch == sizes.batch_size * sizes.unroll_length
 
 
-@pytest.mark.parametrize("body", ["ant", "humanoid"])
+@pytest.mark.parametrize("body", ["ant", pytest.param("humanoid", marks=pytest.mark.nightly)])
 def test_braxs_body_moves_on_our_physics_as_on_braxs(body):
     pytest.importorskip("brax", reason="needs the extra peers")
     from purerl.experiments.peers import brax_env

@@ -28,10 +28,8 @@ RUNS = {
     "recurrent": (HERE / "recurrent.py", ""),
     "dict_observation": (HERE / "privileged.py", ""),
     "four_shards": (EXPERIMENTS / "cartpole_swingup.py", f"{FEW} --num-shards 4"),
-    "recurrent_shards": (HERE / "recurrent.py", "--num-shards 2"),
     "seeing_shards": (HERE / "seeing.py", "--num-shards 2"),
     "vmapped_seeds": (EXPERIMENTS / "cartpole_swingup.py", f"{FEW} --num-seeds 2"),
-    "colored_noise": (EXPERIMENTS / "cartpole_swingup.py", f"{FEW} --ppo.noise-color 0.5"),
     "ant_c": (EXPERIMENTS / "ant_run.py", f"{FEW} --engine c"),
     "ant_jax": (EXPERIMENTS / "ant_run.py", f"{TINY} --engine jax"),
 }

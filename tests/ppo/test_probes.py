@@ -156,7 +156,7 @@ def test_a_bonus_for_being_alive_does_not_spoil_the_first_updates():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("cell", ["gru", "lstm"])
+@pytest.mark.parametrize("cell", ["gru", pytest.param("lstm", marks=pytest.mark.nightly)])
 def test_recurrent_network_remembers_the_cue(cell):
     options = networks.RecurrentOptions(cell=cell, hidden=32, encoder=(32,), value_hidden=(32,))
     assert memory_error(networks.recurrent, options) < 0.1

@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("file_is_compiled_quickl
 
 ROOT = Path(__file__).parent.parent.parent
 PYTHON = blocks(PAGES["docs/howto/export.md"].read_text(), "python")
-SLOW = pytest.mark.slow
+NIGHTLY = pytest.mark.nightly
 FEW = {"ppo.num_steps": 256, "network.value_hidden": (8,), "evaluation.number": 0}
 OWN = {"ppo.num_steps": 512, "ppo.num_envs": 4, "ppo.rollout_length": 16, "ppo.episode_length": 20}
 KINDS = {
@@ -68,10 +68,9 @@ def place(tmp_path_factory) -> Path:
     return tmp_path_factory.mktemp("runs")
 
 
-BOTH = ["relu", "linear", pytest.param("elu", marks=SLOW), pytest.param("gru", marks=SLOW), "lstm"]
-
-
-@pytest.mark.parametrize("kind", BOTH)
+@pytest.mark.parametrize(
+    "kind", ["relu", "elu", "lstm", *(pytest.param(n, marks=NIGHTLY) for n in ("linear", "gru"))]
+)
 def test_npz_and_its_reader_act_as_the_run_does(kind, place, tmp_path):
     run, recorded = trained(kind, place)
     assert recorded.length.sum() == 160

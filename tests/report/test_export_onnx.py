@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import purerl
-from tests.report.test_export import BOTH, PYTHON, place, trained  # noqa: F401 (a fixture)
+from tests.report.test_export import NIGHTLY, PYTHON, place, trained  # noqa: F401 (a fixture)
 
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -29,7 +29,10 @@ def computed(act, *arguments):
     return session.run(None, dict(zip(given, leaves, strict=True)))
 
 
-@pytest.mark.parametrize("kind", [*BOTH, "own"])
+RARE = [pytest.param(kind, marks=NIGHTLY) for kind in ("linear", "elu", "gru")]
+
+
+@pytest.mark.parametrize("kind", ["relu", "lstm", "own", *RARE])
 def test_onnxruntime_acts_as_the_run_does(kind, place, tmp_path):  # noqa: F811
     run, recorded = trained(kind, place)
     file = tmp_path / "policy.onnx"

@@ -173,7 +173,10 @@ def share_a_block(kernel):
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.usefixtures("kernels_are_compiled_quickly")
-@pytest.mark.parametrize("body, share, off", [("ant", 16, 0), ("humanoid", 4, 1e-3)])
+@pytest.mark.parametrize(
+    "body, share, off",
+    [("ant", 16, 0), pytest.param("humanoid", 4, 1e-3, marks=pytest.mark.nightly)],
+)
 def test_a_bodys_control_step_is_xlas(tmp_path, body, share, off):
     """Five substeps and a task's readings, from the air to the floor: contacts come and go."""
     physics = physics_of(body)
