@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import io
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -72,8 +73,6 @@ class JaxEngine:
         self.stepped_by: list[str] | None = None  # of `exact.with_kernel`
         if platform == "gpu" and self.data._impl.efc_J.size <= MOST_OF_A_KERNEL:
             self._apart = _to_compare_on()
-            quickly = {"xla_backend_optimization_level": 0} if self._apart else None
-            self._by_xla = jax.jit(jax.vmap(self._exact_step), compiler_options=quickly)
             self.stepped_by = []
             self._exact_step = exact.with_kernel(
                 self.plain_step, self._exact_step, self._reached, self.stepped_by.append
@@ -117,12 +116,14 @@ class JaxEngine:
         data = self.data.replace(**vars(state)).tree_replace(dict(zip(places, late, strict=True)))
         return state, self._read(_kinematics(model, data))
 
-    def _reached(self, *example: PyTree) -> tuple[tuple, tuple]:
-        """Returns arguments of `step` for some simulations that XLA has stepped, and its results.
+    def _reached(self, step: Callable, *example: PyTree) -> tuple[tuple, tuple]:
+        """Returns arguments of a `step` for some simulations that XLA has stepped, and its results.
 
         They begin as the model says, near rest, and move under random controls.
         """
         state, ctrl, changes = example
+        quickly = {"xla_backend_optimization_level": 0} if self._apart else None
+        by_xla = jax.jit(jax.vmap(step), compiler_options=quickly)
         rng = np.random.default_rng(0)
 
         def several(x: Any, like: Any) -> np.ndarray:
@@ -133,11 +134,11 @@ class JaxEngine:
         )
         states.qvel[:] += 0.1 * rng.normal(size=states.qvel.shape)
         changes = {n: several(getattr(self.model, n), x) for n, x in changes.items()}
-        with mjx_defaults(), jax.default_device(self._apart):
+        with jax.default_device(self._apart):
             for _ in range(TRIED_FOR):
                 ctrls = rng.uniform(-1, 1, (TRIED, *ctrl.shape)).astype(np.float32)
                 args = states, ctrls, changes
-                states, readings = self._by_xla(*args)
+                states, readings = by_xla(*args)
         return jax.tree.map(np.asarray, (args, (states, readings)))
 
     def _changed(self, changes: dict[str, Array]) -> mjx.Model:

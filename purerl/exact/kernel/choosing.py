@@ -27,8 +27,8 @@ def with_kernel(
     Args:
       f: a pure function of pytrees, of one environment.
       by_xla: the same, as XLA shall compute it without a kernel.
-      reached: (*example) -> arguments of several environments with a leading axis, of the shapes of
-        the example, and what XLA makes of them.
+      reached: (f, *example) -> arguments of several environments with a leading axis, of the shapes
+        of the example, and what XLA makes of them. This f need not be traced again.
       say: is told once for each set of shapes what computes it: "one kernel" and who compiled it,
         or why it is XLA.
     """
@@ -58,9 +58,10 @@ def _tried(f: Callable, reached: Callable, example: tuple) -> tuple[compiling.Ke
     # What is traced around this call is no business of the comparison: a thread has no trace. XLA
     # compiles there while a new text is written.
     with concurrent.futures.ThreadPoolExecutor(2) as threads:
-        by_xla = functools.cache(functools.partial(threads.submit, reached, *example))
         try:
-            kernel = compiling.compile_kernel(f, *example, meanwhile=by_xla)
+            traced = compiling.traced(f, *example)
+            by_xla = functools.cache(functools.partial(threads.submit, reached, traced, *example))
+            kernel = compiling.kernel_of(traced, meanwhile=by_xla)
             by = f"NVRTC {compilers.nvrtc_version()}" if jax.default_backend() == "gpu" else "g++"
             block = compilers.block_of(kernel.text, launch.capability())
             if (fit := block.environments) < FEWEST:

@@ -71,9 +71,20 @@ TOLERANCE = 1e-3
 MOST_OFF = 0.01
 
 
-def compile_kernel(
-    f: Callable, *example: Any, meanwhile: Callable[[], Any] = lambda: None
-) -> Kernel:
+class Traced(NamedTuple):
+    """A function as `jax.make_jaxpr` has it: called, it is the function, and not traced again."""
+
+    closed: core.ClosedJaxpr
+    inputs: tuple[Any, list]  # the arguments' pytree, and of each leaf as float32[3]
+    shapes: Any  # of the results, a pytree
+
+    def __call__(self, *args: Any) -> Any:
+        """Computes the function of arguments of those shapes, by XLA."""
+        found = core.jaxpr_as_fun(self.closed)(*jax.tree.leaves(args))
+        return jax.tree.unflatten(jax.tree.structure(self.shapes), found)
+
+
+def compile_kernel(f: Callable, *example: Any) -> Kernel:
     """Returns a function as one kernel: on a GPU a warp for each environment, on a CPU C++.
 
     It is traced and written here, and compiled when it is first called. Loops that depend on data
@@ -83,18 +94,24 @@ def compile_kernel(
     Args:
       f: a pure function of pytrees of float32, int32 and bool arrays, of one environment.
       *example: its arguments, or `jax.ShapeDtypeStruct`s of the same shapes.
-      meanwhile: is called before a text is written, which takes seconds, and not if one is kept.
 
     Raises:
       NoRuleError: the first equation that no kernel computes; `kernel_missing` lists them all.
     """
-    closed, inputs, shapes = _traced(f, *example)
-    return Kernel(_written(closed, meanwhile), shapes, inputs)
+    return kernel_of(traced(f, *example))
+
+
+def kernel_of(traced: Traced, meanwhile: Callable[[], Any] = lambda: None) -> Kernel:
+    """Returns a traced function as one kernel.
+
+    `meanwhile` is called before a text is written, which takes seconds, and not if one is kept.
+    """
+    return Kernel(_written(traced.closed, meanwhile), traced.shapes, traced.inputs)
 
 
 def kernel_missing(f: Callable, *example: Any) -> list[Missing]:
     """Lists what of a function no kernel computes, and where it was written; nothing: all is."""
-    return reading.missing(_traced(f, *example)[0])
+    return reading.missing(traced(f, *example).closed)
 
 
 def _written(closed: core.ClosedJaxpr, meanwhile: Callable[[], Any]) -> text.Text:
@@ -112,11 +129,12 @@ def _written(closed: core.ClosedJaxpr, meanwhile: Callable[[], Any]) -> text.Tex
     return text.Text(*found, *(tuple(map(tuple, x)) for x in (inputs, outputs)))
 
 
-def _traced(f: Callable, *example: Any) -> tuple[core.ClosedJaxpr, Any, Any]:
+def traced(f: Callable, *example: Any) -> Traced:
+    """Traces a function of pytrees."""
     leaves, tree = jax.tree.flatten(example)
     flat = lambda *leaves: f(*jax.tree.unflatten(tree, leaves))  # noqa: E731
     closed, shapes = jax.make_jaxpr(flat, return_shape=True)(*leaves)
-    return closed, (tree, [_words(x) for x in leaves]), shapes
+    return Traced(closed, (tree, [_words(x) for x in leaves]), shapes)
 
 
 def _words(x: Any) -> str:
