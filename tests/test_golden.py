@@ -10,7 +10,7 @@ import pytest
 
 GOLDEN = Path(__file__).parent / "golden"
 TABLE = json.loads((GOLDEN / "digests.json").read_text())
-QUICK = ("ant_c", "cartpole", "four_shards", "statistics")
+QUICK = ("cartpole", "statistics")
 MARKS = {False: (), True: pytest.mark.slow}
 
 

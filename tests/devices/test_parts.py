@@ -172,6 +172,7 @@ def test_on_a_gpu_minibatches_are_cut_in_slices(monkeypatch):
     assert metrics["skipped_minibatches"] == 0 and metrics["gradient_norm"] > 0
 
 
+@pytest.mark.slow
 def test_pooled_moments_are_those_of_all_samples():
     samples = jax.random.normal(jax.random.key(1), (4, 5, 2)) * 3.0 + 40.0
     valid = jax.random.bernoulli(jax.random.key(2), 0.7, (4, 5)).at[1].set(False)

@@ -137,6 +137,7 @@ def test_the_ground_around_is_told_from_where_the_body_looks(terrain):
     assert float(told[0, 7]) == pytest.approx(float(right), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_the_terrain_is_drawn(terrain):
     """The columns below the body end where the ground is, none is above it."""
     # Operation by operation: each program fuses, and so rounds, them in its own way.

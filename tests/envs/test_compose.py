@@ -115,6 +115,7 @@ def with_real_platforms(body, arena, course, monkeypatch):
         return compose(body, arena, engine="c").model
 
 
+@pytest.mark.slow
 def test_the_window_equals_all_platforms(case, monkeypatch):
     body, corridor = case
     arena = short(corridor)

@@ -114,6 +114,7 @@ def test_known_bodies_have_the_sizes_that_others_have(tmp_path, body, set_, size
     assert env.control_timestep == pytest.approx(0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [45, 90, 180])
 def test_nothing_tells_where_it_is_or_which_way_it_heads(env, place, degrees):
     other = imitation.build(options(place, clips=str(place / f"turned{degrees}.h5")), "c")
@@ -312,6 +313,7 @@ def test_squats_keep_the_feet_on_the_floor_and_the_weight_above_them():
         assert behind - 0.03 < data.subtree_com[1, 0] < ahead + 0.03
 
 
+@pytest.mark.slow
 def test_a_body_that_runs_feels_what_one_that_imitates_does(tmp_path):
     model = body_parts.find("rodent", (), "c", 0.004).model
     crouched = np.tile(model.qpos0, (20, 1))

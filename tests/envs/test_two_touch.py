@@ -60,7 +60,9 @@ class Theirs:
         return self.task.get_reward(self) - 0.25, int(self.task._state_logic)
 
 
-@pytest.mark.parametrize("share", [0.02, 0.1, 0.4])
+@pytest.mark.parametrize(
+    "share", [0.1, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.02, 0.4))]
+)
 def test_taps_are_judged_as_in_dm_control(share):
     """3 s each: 4,000 steps of random taps."""
     random, theirs = np.random.default_rng(0), Theirs()

@@ -188,6 +188,7 @@ def resume(copy: Path, runs: Path) -> subprocess.CompletedProcess:
     )
 
 
+@pytest.mark.slow
 def test_what_moves_no_bit_keeps_nobody_from_resuming_and_what_does_is_named(copy, tmp_path):
     runs = tmp_path / "runs"
     assert run.main([str(TOY), "--runs", str(runs)]) == SUCCESS

@@ -162,6 +162,7 @@ def test_a_link_to_a_run_is_a_run_and_a_link_to_code_is_none(given, tmp_path, ca
     assert "leaves the run's folder" in only_line(capsys)
 
 
+@pytest.mark.slow
 def test_a_home_that_cannot_be_written_to_stops_no_run(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_STATE_HOME", "/dev/null/none")
     trained = purerl.train(TOY, {"ppo.num_steps": 32}, runs=tmp_path)

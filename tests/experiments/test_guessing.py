@@ -39,6 +39,7 @@ def made():
     return network, bright, jnp.broadcast_to(memory, (5, *memory.shape))
 
 
+@pytest.mark.slow
 def test_the_actor_is_not_told_and_the_value_function_is(made):
     network, params, memory = made
     seen = observed(5)

@@ -308,6 +308,7 @@ def logged(folder):
     return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
 
 
+@pytest.mark.slow
 def test_decoder_and_prior_stay_the_other_runs_to_the_bit_and_read_in_its_units(old, reused):
     before, after = saved(old), saved(reused)
     frozen = {k for k in after if k.startswith(("params/params/decoder/", "params/params/prior/"))}

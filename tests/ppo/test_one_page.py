@@ -10,6 +10,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from purerl import Config, networks
 from purerl.envs import cartpole_swingup
@@ -64,6 +65,7 @@ def as_on_the_page(state):
 OPTIONS = {"xla_disable_hlo_passes": "fusion", "xla_backend_optimization_level": 0}
 
 
+@pytest.mark.slow
 def test_the_page_computes_the_same_bits():
     page = load_page()
     env = cartpole_swingup.build(engine="c")

@@ -379,6 +379,7 @@ def test_runs_that_promise_no_bits_may_differ(tmp_path):
     assert pair["same"] is False and not pair["promised"]
 
 
+@pytest.mark.slow
 def test_real_runs_part_at_a_named_leaf(tmp_path, capsys):
     runs = tmp_path / "runs"
     for name, seed in (("one", "1"), ("two", "2")):

@@ -66,6 +66,7 @@ def only_line(capsys) -> str:
 # --- files ---
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("opengl")
 def test_video_and_sheet_show_the_episode_in_real_time(trained, capsys):
     words = ["--size", "160x120", "--seconds", "0.8", "--episodes", "2"]
@@ -102,6 +103,7 @@ def test_what_is_not_the_default_stands_in_the_name(trained, capsys):
     assert re.search(r"evaluation after update 3: return .* in that range: [01] of 1", said)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("opengl")
 def test_another_environment_and_a_lesion_are_shown_and_named(trained, capsys):
     """6 s."""

@@ -137,6 +137,7 @@ def test_a_run_that_was_stopped_goes_on(trained, tmp_path, monkeypatch):
     assert run_.digest == trained.digest
 
 
+@pytest.mark.slow
 def test_debug_makes_an_experiment_tiny_and_leaves_no_run_here(tmp_path, monkeypatch):
     """2 s."""
     monkeypatch.chdir(tmp_path)

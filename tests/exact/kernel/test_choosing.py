@@ -94,6 +94,7 @@ def test_xla_computes_what_no_kernel_can_and_says_why(function, why):
     assert re.match(why, line), line
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.usefixtures("compiled_quickly")
 @pytest.mark.parametrize("cores", [2, 4])
