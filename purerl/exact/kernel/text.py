@@ -184,7 +184,9 @@ class _Writer(Cells):
         for number, row in rows:
             switch = "" if row.factor is None else f"if ({self._leaves(row)[row.factor]} != 0) "
             switched.setdefault(switch, []).append((number, row))
-        return " ".join(f"{x}{{ {self._block(fold, kind, y)} }}" for x, y in switched.items())
+        blocks = {switch: self._block(fold, kind, some) for switch, some in switched.items()}
+        plain = list(blocks) == [""]
+        return " ".join(y if plain else f"{x}{{ {y} }}" for x, y in blocks.items())
 
     def _block(self, fold: str, kind: str, rows: list[tuple[int, shared_rows.Row]]) -> str:
         body: dict[str, str] = {}  # C -> its name
