@@ -182,11 +182,10 @@ class _Writer(Cells):
         """Returns C that adds a term to each of some rows, by the number of its sum."""
         switched: dict[str, list[tuple[int, shared_rows.Row]]] = {}
         for number, row in rows:
-            switch = "" if row.factor is None else f"if ({self._leaves(row)[row.factor]} != 0) "
+            switch = "" if row.factor is None else self._read(row, row.factor)
             switched.setdefault(switch, []).append((number, row))
-        blocks = {switch: self._block(fold, kind, some) for switch, some in switched.items()}
-        plain = list(blocks) == [""]
-        return " ".join(y if plain else f"{x}{{ {y} }}" for x, y in blocks.items())
+        blocks = [(switch, self._block(fold, kind, some)) for switch, some in switched.items()]
+        return " ".join(f"if ({x} != 0) {{ {y} }}" if x else y for x, y in blocks)
 
     def _block(self, fold: str, kind: str, rows: list[tuple[int, shared_rows.Row]]) -> str:
         body: dict[str, str] = {}  # C -> its name
@@ -197,11 +196,11 @@ class _Writer(Cells):
             sums.append(f"SUM({number}) = {text};")
         return " ".join([*(f"auto {name} = {text};" for text, name in body.items()), *sums])
 
-    def _leaves(self, row: shared_rows.Row) -> list[str]:
-        """Returns C for what a term of a row reads."""
-        at, first = (row.number, row.terms), row.place()[0]
-        leaves = [x._replace(which=x.which[at], at=x.at[at]) for x in row.statement.code.leaves]
-        return [self.leaf(leaf, f"(i-{first})" if first else "i") for leaf in leaves]
+    def _read(self, row: shared_rows.Row, number: int) -> str:
+        """Returns C for a leaf of a row's term."""
+        at, first, leaf = (row.number, row.terms), row.place()[0], row.statement.code.leaves[number]
+        leaf = leaf._replace(which=leaf.which[at], at=leaf.at[at])
+        return self.leaf(leaf, f"(i-{first})" if first else "i")
 
     def _row(self, row: shared_rows.Row, known: dict[str, str]) -> str:
         """Adds the lines for a term of one row to those known; returns the name of the term."""
@@ -209,7 +208,8 @@ class _Writer(Cells):
         def name(text: str) -> str:
             return known.setdefault(text, f"v{len(known)}")
 
-        code, names = row.statement.code, list(map(name, self._leaves(row)))
+        code = row.statement.code
+        names = [name(self._read(row, number)) for number in range(len(code.leaves))]
         results: list[str] = []
         for line in code.lines:
             args = [names[~arg] if arg < 0 else results[arg] for arg in line.args]
