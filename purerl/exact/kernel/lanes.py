@@ -8,8 +8,6 @@ device, and in the C++ of one lane.
 - Any other row, from its first term to its last.
 - Terms that are known to be 0 may be left out of a row (`Builder._packed`): what is left is a row.
   Where lanes share a row each leaves out its own (`terms_of`), and the sum is bit for bit the same.
-- So it is where a term of a shared row has a factor in common with all other rows that turns out to
-  be 0: it is not looked at. Of 303 constraints of a falling humanoid 5 act. 0 times infinity is 0.
 """
 
 import math

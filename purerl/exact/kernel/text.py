@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from purerl.exact.kernel import memory, operations, shared_rows, side_by_side
+from purerl.exact.kernel import lanes, memory, operations, side_by_side
 from purerl.exact.kernel.cells import TYPES, Cells
 from purerl.exact.kernel.lanes import LANES
 from purerl.exact.kernel.reading import Program
@@ -57,6 +57,20 @@ def written(program: Program) -> Text:
 
 def _numbers(arrays: Sequence[np.ndarray], suffix: str = "") -> str:
     return ",".join(f"{x}{suffix}" for array in arrays for x in array) or "0"
+
+
+class _Row(NamedTuple):
+    """A sum that lanes share: one number of a statement, and which terms are added."""
+
+    statement: Statement
+    number: int
+    terms: np.ndarray  # see `lanes.terms_of`
+
+    def place(self) -> tuple[int, int]:
+        """Returns where the loop over its terms begins and ends."""
+        line = len(self.terms) and (np.diff(self.terms) == 1).all()
+        first = int(self.terms[0]) if line else 0
+        return first, first + len(self.terms)
 
 
 class _Writer(Cells):
@@ -111,8 +125,8 @@ class _Writer(Cells):
 
     def _level(self, level: Sequence[Statement | StepStatement]) -> Iterator[str]:
         plain = [x for x in level if isinstance(x, Statement)]
-        shared = sorted((x for x in plain if x.shared), key=shared_rows.shape)
-        for _, some in itertools.groupby(shared, shared_rows.shape):
+        shared = sorted((x for x in plain if x.shared), key=_shape)
+        for _, some in itertools.groupby(shared, _shape):
             yield from self._shared(list(some))
         others = [x for x in plain if not x.shared]
         yield from map(self._fold, (x for x in others if x.terms > FEW_TERMS))
@@ -164,12 +178,12 @@ class _Writer(Cells):
 
     def _shared(self, statements: list[Statement]) -> Iterator[str]:
         """The lanes share each row. Rows of equal length are in one loop, and read once."""
-        fold, _, kind = shared_rows.shape(statements[0])
-        rows = [row for x in statements for row in shared_rows.distinct_rows(x)]
-        rows.sort(key=shared_rows.Row.place)
+        fold, _, kind = _shape(statements[0])
+        rows = [row for x in statements for row in _distinct_rows(x)]
+        rows.sort(key=_Row.place)
         for start in range(0, len(rows), AT_ONCE):
             some = rows[start : start + AT_ONCE]
-            count, neutral = shared_rows.padded(len(some)), operations.neutral(fold, kind)
+            count, neutral = _padded(len(some)), operations.neutral(fold, kind)
             yield f"{self.one()} {{ SUMS({TYPES[kind]}, {count}, {neutral})"
             for (first, end), alike in itertools.groupby(enumerate(some), lambda x: x[1].place()):
                 if end > first:  # else all of its terms are 0
@@ -178,16 +192,8 @@ class _Writer(Cells):
             memory = "P" if kind == "f" else "I"
             yield f"PUT(joined_by_{fold}, {count}, {len(some)}, {memory}, T+{to}, T+{also}) }}"
 
-    def _sums(self, fold: str, kind: str, rows: Iterator[tuple[int, shared_rows.Row]]) -> str:
+    def _sums(self, fold: str, kind: str, rows: Iterator[tuple[int, _Row]]) -> str:
         """Returns C that adds a term to each of some rows, by the number of its sum."""
-        switched: dict[str, list[tuple[int, shared_rows.Row]]] = {}
-        for number, row in rows:
-            switch = "" if row.factor is None else self._read(row, row.factor)
-            switched.setdefault(switch, []).append((number, row))
-        blocks = [(switch, self._block(fold, kind, some)) for switch, some in switched.items()]
-        return " ".join(f"if ({x} != 0) {{ {y} }}" if x else y for x, y in blocks)
-
-    def _block(self, fold: str, kind: str, rows: list[tuple[int, shared_rows.Row]]) -> str:
         body: dict[str, str] = {}  # C -> its name
         sums = []
         for number, row in rows:
@@ -196,31 +202,27 @@ class _Writer(Cells):
             sums.append(f"SUM({number}) = {text};")
         return " ".join([*(f"auto {name} = {text};" for text, name in body.items()), *sums])
 
-    def _read(self, row: shared_rows.Row, number: int) -> str:
-        """Returns C for a leaf of a row's term."""
-        at, first, leaf = (row.number, row.terms), row.place()[0], row.statement.code.leaves[number]
-        leaf = leaf._replace(which=leaf.which[at], at=leaf.at[at])
-        return self.leaf(leaf, f"(i-{first})" if first else "i")
-
-    def _row(self, row: shared_rows.Row, known: dict[str, str]) -> str:
+    def _row(self, row: _Row, known: dict[str, str]) -> str:
         """Adds the lines for a term of one row to those known; returns the name of the term."""
 
         def name(text: str) -> str:
             return known.setdefault(text, f"v{len(known)}")
 
-        code = row.statement.code
-        names = [name(self._read(row, number)) for number in range(len(code.leaves))]
+        code, at = row.statement.code, (row.number, row.terms)
+        leaves = [x._replace(which=x.which[at], at=x.at[at]) for x in code.leaves]
+        i = f"(i-{row.place()[0]})" if row.place()[0] else "i"
+        names = [name(self.leaf(leaf, i)) for leaf in leaves]
         results: list[str] = []
         for line in code.lines:
             args = [names[~arg] if arg < 0 else results[arg] for arg in line.args]
             results.append(name(self.operation(code, line, args)))
         return names[~code.result] if code.result < 0 else results[code.result]
 
-    def _targets(self, rows: Sequence[shared_rows.Row]) -> tuple[np.ndarray, np.ndarray]:
-        """Returns where each row's result is put, and where a second time: `mirrored`."""
+    def _targets(self, rows: Sequence[_Row]) -> tuple[np.ndarray, np.ndarray]:
+        """Returns where each row's result is put, and where a second time: see `_distinct_rows`."""
         first = np.array([self.address[row.statement.writes[0]] for row in rows])
         to = [row.number for row in rows]
-        also = [shared_rows.mirrored(row.statement, row.number) for row in rows]
+        also = [_mirrored(row.statement, row.number) for row in rows]
         return first + np.array(to), first + np.array(also)
 
     # --- steps ---
@@ -276,3 +278,26 @@ class _Writer(Cells):
         steps = f"1, {n}" if step.transposed else f"{n}, 1"
         forward = int(step.lower != step.transposed)
         return f"{self.one()} solve<{n}, {steps}, {forward}>(P + {matrix}, P + {to}, lane);"
+
+
+def _shape(statement: Statement) -> tuple[str, int, str]:
+    return statement.fold, statement.terms, statement.writes[0].kind
+
+
+def _distinct_rows(statement: Statement) -> list[_Row]:
+    """Returns the rows to sum: of a symmetric square those of its lower half."""
+    n = statement.width
+    rows = [r * n + c for r in range(n) for c in range(r + 1)] or list(range(statement.size))
+    assert statement.zero is not None
+    terms = lanes.terms_of(statement.zero[rows])
+    return [_Row(statement, *row) for row in zip(rows, terms, strict=True)]
+
+
+def _mirrored(statement: Statement, row: int) -> int:
+    n = statement.width
+    return row % n * n + row // n if n else row
+
+
+def _padded(number: int) -> int:
+    """Returns how many results lanes sum: a power of 2, or a multiple of LANES; see `put`."""
+    return 1 << (number - 1).bit_length() if number < LANES else -(-number // LANES) * LANES

@@ -2,6 +2,7 @@
 
 import json
 import re
+import threading
 from functools import partial
 
 import jax
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from purerl import exact, run
-from purerl.exact.kernel import compilers
+from purerl.exact.kernel import compilers, text
 from purerl.physics import engine_mjx
 from purerl.physics.interface import Physics
 from tests.exact.kernel import needs_compiler
@@ -92,6 +93,32 @@ def test_xla_computes_what_no_kernel_can_and_says_why(function, why):
     np.testing.assert_array_equal(found["sine"], jax.jit(jax.vmap(by_xla))(ROWS)["sine"])
     (line,) = said
     assert re.match(why, line), line
+
+
+@needs_compiler
+def test_on_a_gpu_nvrtc_compiles_beside_xla_once_the_text_is_written(monkeypatch):
+    """As on a GPU, with g++'s kernel. Neither is asked where it is known how the two agree."""
+    both, began, said, plain = threading.Barrier(2, timeout=30), [], [], text.written
+
+    def for_gpu(*_):
+        began.append("NVRTC")
+        both.wait()  # an error if the other does not begin
+        if not said:
+            raise compilers.CompilerError("NVRTC refuses it.")
+
+    def watched(*args):
+        began.append("XLA")
+        both.wait()
+        return reached(*args)
+
+    monkeypatch.setattr(text, "written", lambda x: began.append("text") or plain(x))
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(compilers, "nvrtc_version", lambda: "13.0")
+    monkeypatch.setattr(compilers, "for_gpu", for_gpu)
+    for _ in range(3):
+        exact.with_kernel(doubled, by_xla, watched, said.append)(ROWS[0])
+    assert said == ["XLA: NVRTC refuses it."] + ["one kernel, by NVRTC 13.0"] * 2
+    assert began[0] == "text" and sorted(began[1:]) == ["NVRTC"] * 2 + ["XLA"] * 2
 
 
 @pytest.mark.slow

@@ -184,18 +184,3 @@ def of_parts(j, d):
 def test_a_square_of_sums_is_halved_where_it_is_symmetric(width, function):
     (fold,) = folds_of(function, J, J[:, 0])
     assert lanes.width_of(fold) == width
-
-
-@needs_compiler
-def test_a_term_is_not_looked_at_where_a_factor_that_all_rows_share_is_zero(tmp_path):
-    """A constraint that does not act: its row of a Jacobian is infinite here, and adds nothing."""
-    acts = np.arange(150) % 7 == 0
-    d = np.where(acts, np.linspace(0.5, 2, 150), 0).astype(np.float32)
-    j, columns = ROWS[:, :20], np.where(acts[:, None], ROWS[:, :20], np.inf)
-    kernel = exact.compile_kernel(lambda j, d: j.T @ (d[:, None] * j), j, d)
-    zeros = by_one_lane(kernel.text, np.where(acts[:, None], j, 0).reshape(1, -1), d[None])
-    given = columns.astype(np.float32).reshape(1, -1), d[None]
-    found = by_one_lane(kernel.text, *given)
-    warps = by_warps(kernel.text, *given, folder=tmp_path, environments=1, warps=2)
-    for (one,), (other,) in ((zeros, found), (zeros, warps)):
-        assert np.isfinite(one).all() and (one.view(np.int32) == other.view(np.int32)).all()
