@@ -181,17 +181,26 @@ class Builder:
             for term in range(1, terms):
                 found = self.map(op, found, self.pick(arg, rows[:, term]))
             return self.take(found, np.arange(size).reshape(shape))
-        new = values.Fold(shape, arg.kind, self.top, op, arg, terms)
-        new.width = lanes.width_of(new)
-        new.shared = lanes.are_shared(new)
-        packed = None if new.width else self._packed(new)
-        return packed or self._once(("fold", op, id(arg), shape), new, [arg])
+        shared = lanes.are_shared(size, terms)
+        new = values.Fold(shape, arg.kind, self.top, op, arg, terms, shared)
+        if n := lanes.width_of(new):
+            return self._lower_half(new, n)
+        return self._packed(new) or self._once(("fold", op, id(arg), shape), new, [arg])
+
+    def _lower_half(self, fold: values.Fold, n: int) -> Value:
+        """Returns a symmetric square of sums, which a Hessian is, made of its lower half."""
+        some, index = np.unique(lanes.lower_rows(n), return_inverse=True)
+        arg = self.pick(fold.arg, fold.arg.places.reshape(-1, fold.terms)[some])
+        shared = fold.terms >= lanes.LANES and n <= lanes.WIDEST
+        new = values.Fold(some.shape, fold.kind, self.top, fold.op, arg, fold.terms, shared)
+        packed = None if shared else self._packed(new)
+        half = packed or self._once(("half", id(arg)), new, [arg])
+        return self.take(half, index.reshape(fold.shape))
 
     def _packed(self, fold: values.Fold) -> Value | None:
         """Returns a fold without most of its terms that are known to be 0; None if they are few.
 
-        Rows of about as many other terms are made one fold. Of a symmetric square, which a Hessian
-        is, the upper half is the lower one.
+        Rows of about as many other terms are made one fold.
         """
         if fold.op != "add" or fold.arg.size < MANY_TERMS:
             return None
@@ -200,10 +209,6 @@ class Builder:
         if MANY_ZEROS * counts.sum() > fold.arg.size:
             return None
         order, terms = np.argsort(zero, 1, kind="stable"), fold.arg.places.reshape(zero.shape)
-        n = lanes.width_of(fold, fold.size)
-        rows = np.arange(fold.size)
-        mirrored = rows % n * n + rows // n if n else rows
-        rows, counts = np.maximum(rows, mirrored), np.where(rows < mirrored, 0, counts)
         parts: list[Value] = [self.const(np.zeros(1, DTYPES[fold.kind]))]
         which, index = np.zeros(fold.size, int), np.zeros(fold.size, int)
         while (most := counts.max()) > 0:
@@ -212,7 +217,7 @@ class Builder:
             places = terms[some[:, None], order[some, :most]]
             parts.append(self.fold("add", self.pick(fold.arg, places), (len(some),)))
             counts[some] = 0
-        return self.view(parts, which[rows].reshape(fold.shape), index[rows].reshape(fold.shape))
+        return self.view(parts, which.reshape(fold.shape), index.reshape(fold.shape))
 
     def take(self, value: Value, index: np.ndarray) -> Value:
         """Returns the numbers at places, in the shape of `index`."""

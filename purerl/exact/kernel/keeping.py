@@ -24,7 +24,7 @@ MOST_REPEATED = 16  # additions that may be made again, in all, because numbers 
 # large one, which would take much memory, if it costs several times as much.
 FEW_USES, CHEAP = 4, 1
 LARGE, CHEAP_OF_LARGE = 400, 8
-MUCH = 1024  # known zeros of a value: then they are left out, and where the others stand is a table
+MUCH = 256  # known zeros of a value: then they are left out, and where the others stand is a table
 
 
 def blocks_of(step: Step) -> list[Block]:

@@ -25,25 +25,28 @@ WIDEST = 32  # a square of sums, such as a Hessian, is shared too, if it has no 
 SHORTEST = 0.6
 
 
-def are_shared(fold: Fold) -> bool:
-    """Tells whether the lanes share the rows of a fold."""
-    return fold.terms >= LANES and (fold.size <= FEW_ROWS or fold.width > 0)
+def are_shared(rows: int, terms: int) -> bool:
+    """Tells whether the lanes share each of some rows, which are no square."""
+    return terms >= LANES and rows <= FEW_ROWS
 
 
-def width_of(fold: Fold, widest: int = WIDEST) -> int:
-    """Returns n if the rows are an [n, n] of sums of products that is symmetric, else 0.
-
-    It is 0, too, if n is more than `widest`.
-    """
+def width_of(fold: Fold) -> int:
+    """Returns n if the rows are an [n, n] of sums of products that is symmetric, else 0."""
     n = math.isqrt(fold.size)
     products = isinstance(fold.arg, Map) and fold.arg.op == "mul" and fold.op == "add"
-    if not products or n * n != fold.size or not 1 < n <= widest:
+    if not products or n * n != fold.size or n < 2:
         return 0
     factors = list(_factors(fold.arg, np.arange(fold.arg.size)))
     ids, index = (np.stack(parts, -1) for parts in zip(*factors, strict=True))
     _, number = np.unique(ids, return_inverse=True)
     factor = (number.reshape(ids.shape) * (1 << 32) + index).reshape(n, n, fold.terms, -1)
     return n if (np.sort(factor) == np.sort(factor.swapaxes(0, 1))).all() else 0
+
+
+def lower_rows(n: int) -> np.ndarray:
+    """Returns for each number of a symmetric [n, n] the place of its equal in the lower half."""
+    row, column = np.divmod(np.arange(n * n), n)
+    return np.maximum(row, column) * n + np.minimum(row, column)
 
 
 def terms_of(zero: np.ndarray) -> list[np.ndarray]:

@@ -29,14 +29,14 @@
 #define IS(turn) (WARPS == 1 || thread / 32 == (turn) % WARPS)
 #define LANES(i, first, end) \
   _Pragma("unroll 1") for (int i = (first) + ((lane - (first)) & 31); i < (end); i += 32)
-#define ROUNDS(j, n) _Pragma("unroll 1") for (int j = 0; j < (n); ++j)
+#define ROUNDS(j, n) _Pragma("unroll 32") for (int j = 0; j < (n); ++j)  // loads before sums
 #define REPEAT(j, n) for (int j = 0, end = unknown(n); j < end; ++j)  // too long to be unrolled
 #define SYNC together()
 #define LOCKSTEP __syncthreads()
 #define UNIFORM(x) uniform(x)
 #define SUMS(type, n, start) type sums[n]; _Pragma("unroll") for (int k = 0; k < n; ++k) sums[k] = start;
 #define SUM(k) sums[k]
-#define PUT(join, n, used, memory, to, also) put<n, used>(sums, memory, to, also, lane, join());
+#define PUT(join, n, used, memory, to) put<n, used>(sums, memory, to, lane, join());
 #define BEGIN \
   const int thread = threadIdx.x % THREADS, lane = threadIdx.x & 31; \
   const int asked = blockIdx.x * ENVIRONMENTS + threadIdx.x / THREADS; \
@@ -102,7 +102,7 @@ FUNCTION int uniform(int x) {
 #define UNIFORM(x) (x)
 #define SUMS(type, n, start) type sums[n][32]; for (auto& row : sums) for (auto& x : row) x = start;
 #define SUM(k) sums[k][i & 31]
-#define PUT(join, n, used, memory, to, also) put<used>(sums, memory, to, also, join());
+#define PUT(join, n, used, memory, to) put<used>(sums, memory, to, join());
 #define BEGIN \
   const int lane = 0, thread = 0; \
   const bool there = true; \
@@ -162,28 +162,23 @@ FUNCTION void joined(X* sums, int lane, Join join) {
   if constexpr (far > 1) joined<(n > far ? far : n), far / 2>(sums, lane, join);
 }
 template <int n, int used, class X, class Join>
-FUNCTION void put(
-    X* sums, X* memory, const unsigned short* to, const unsigned short* also, int lane, Join join) {
+FUNCTION void put(X* sums, X* memory, const unsigned short* to, int lane, Join join) {
 #pragma unroll
   for (int first = 0; first < n; first += 32) {
     joined<(n < 32 ? n : 32), 16>(sums + first, lane, join);
-    if (lane < 32 && lane < used - first) {
-      memory[to[first + lane]] = sums[first];
-      memory[also[first + lane]] = sums[first];
-    }
+    if (lane < 32 && lane < used - first) memory[to[first + lane]] = sums[first];
   }
 }
 
 #else
 
 template <int used, class X, class Join>
-FUNCTION void put(
-    X (*sums)[32], X* memory, const unsigned short* to, const unsigned short* also, Join join) {
+FUNCTION void put(X (*sums)[32], X* memory, const unsigned short* to, Join join) {
   for (int k = 0; k < used; ++k) {
     X* lanes = sums[k];
     for (int far = 16; far; far /= 2)
       for (int l = 0; l < far; ++l) lanes[l] = join(lanes[l], lanes[l + far]);
-    memory[to[k]] = memory[also[k]] = lanes[0];
+    memory[to[k]] = lanes[0];
   }
 }
 
@@ -207,7 +202,8 @@ ROUTINE void cholesky(float* A, int thread) {
 #pragma unroll
     for (int j = 0; j < n; ++j) {
       const float d = pivot_of(__shfl_sync(~0u, row[j], j));
-      row[j] = r == j ? d : row[j] * (1.0f / d);
+      const float scaled = row[j] * (1.0f / d);
+      row[j] = r == j ? d : scaled;
 #pragma unroll
       for (int c = j + 1; c < n; ++c) row[c] -= row[j] * __shfl_sync(~0u, row[j], c);
     }
@@ -241,7 +237,7 @@ ROUTINE void solve(const float* A, float* x, int lane) {
     y[t] = r < n ? x[r] : 0.0f;
     per_pivot[t] = r < n ? 1.0f / A[r * (down + across)] : 0.0f;
   }
-#pragma unroll 1
+#pragma unroll 32
   for (int q = 0; q < n; ++q) {
     const int k = forward ? q : n - 1 - q;
     float mine = 0;

@@ -79,10 +79,9 @@ class Scheduler:
         row = self.keep[item]
         if isinstance(item, Fold):
             terms = item.arg.places.reshape(-1, item.terms)[row.places]
-            width = item.width if len(row.places) == item.size else 0
             zero = self.zeros.of(item.arg)[terms] & (item.op == "add")
             code = self.code(item.arg, terms)
-            return Statement([row.home], code, item.op, item.terms, item.shared, width, zero)
+            return Statement([row.home], code, item.op, item.terms, item.shared, zero)
         code = Code()
         code.result = _Expression(self, code).compute(item, row.places)
         return Statement([row.home], code)

@@ -67,7 +67,6 @@ class Statement:
     fold: str = ""  # the operation between terms
     terms: int = 1
     shared: bool = False  # whether the lanes share each row
-    width: int = 0  # n if the rows are a symmetric square [n, n] of shared sums
     zero: np.ndarray | None = None  # of shared rows: which terms are known to be 0, [rows, terms]
     waits = True  # it may run as late as it can
 

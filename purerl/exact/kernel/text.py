@@ -179,7 +179,7 @@ class _Writer(Cells):
     def _shared(self, statements: list[Statement]) -> Iterator[str]:
         """The lanes share each row. Rows of equal length are in one loop, and read once."""
         fold, _, kind = _shape(statements[0])
-        rows = [row for x in statements for row in _distinct_rows(x)]
+        rows = [row for x in statements for row in _rows(x)]
         rows.sort(key=_Row.place)
         for start in range(0, len(rows), AT_ONCE):
             some = rows[start : start + AT_ONCE]
@@ -188,9 +188,9 @@ class _Writer(Cells):
             for (first, end), alike in itertools.groupby(enumerate(some), lambda x: x[1].place()):
                 if end > first:  # else all of its terms are 0
                     yield f"LANES(i, {first}, {end}) {{ {self._sums(fold, kind, alike)} }}"
-            to, also = (self.tables.place(x) for x in self._targets(some))
+            to = self.tables.place(np.array([self.address[x.writes[0]] + n for x, n, _ in some]))
             memory = "P" if kind == "f" else "I"
-            yield f"PUT(joined_by_{fold}, {count}, {len(some)}, {memory}, T+{to}, T+{also}) }}"
+            yield f"PUT(joined_by_{fold}, {count}, {len(some)}, {memory}, T+{to}) }}"
 
     def _sums(self, fold: str, kind: str, rows: Iterator[tuple[int, _Row]]) -> str:
         """Returns C that adds a term to each of some rows, by the number of its sum."""
@@ -217,13 +217,6 @@ class _Writer(Cells):
             args = [names[~arg] if arg < 0 else results[arg] for arg in line.args]
             results.append(name(self.operation(code, line, args)))
         return names[~code.result] if code.result < 0 else results[code.result]
-
-    def _targets(self, rows: Sequence[_Row]) -> tuple[np.ndarray, np.ndarray]:
-        """Returns where each row's result is put, and where a second time: see `_distinct_rows`."""
-        first = np.array([self.address[row.statement.writes[0]] for row in rows])
-        to = [row.number for row in rows]
-        also = [_mirrored(row.statement, row.number) for row in rows]
-        return first + np.array(to), first + np.array(also)
 
     # --- steps ---
 
@@ -284,18 +277,10 @@ def _shape(statement: Statement) -> tuple[str, int, str]:
     return statement.fold, statement.terms, statement.writes[0].kind
 
 
-def _distinct_rows(statement: Statement) -> list[_Row]:
-    """Returns the rows to sum: of a symmetric square those of its lower half."""
-    n = statement.width
-    rows = [r * n + c for r in range(n) for c in range(r + 1)] or list(range(statement.size))
+def _rows(statement: Statement) -> list[_Row]:
     assert statement.zero is not None
-    terms = lanes.terms_of(statement.zero[rows])
-    return [_Row(statement, *row) for row in zip(rows, terms, strict=True)]
-
-
-def _mirrored(statement: Statement, row: int) -> int:
-    n = statement.width
-    return row % n * n + row // n if n else row
+    terms = lanes.terms_of(statement.zero)
+    return [_Row(statement, number, some) for number, some in enumerate(terms)]
 
 
 def _padded(number: int) -> int:

@@ -91,9 +91,7 @@ class Fold(Value):
     op: str
     arg: Value
     terms: int
-    # See `lanes.py`: n if the rows are a symmetric square [n, n], and whether lanes share each row.
-    width: int = 0
-    shared: bool = False
+    shared: bool = False  # whether lanes share each row: see `lanes.py`
 
 
 @dataclass(eq=False, repr=False)
