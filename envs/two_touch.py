@@ -21,7 +21,7 @@ from purerl.envs.touch import touched
 
 BEFORE, ONCE, TWICE, TOO_SOON, TOO_LATE = range(5)
 HEIGHT, AREA = 0.14, 1.5  # of the orb: above the ground, +- from the middle [m]
-REWARD, NEAR = 25.0, 0.01  # for each right tap; the share of it that being near earns in a step
+REWARD, NEAR = 25.0, 0.01  # dm_control's: for each right tap; its share that a hand near it earns
 INTERVAL, TOLERANCE, DEBOUNCE, TIMEOUT = 0.8, 0.1, 0.2, 1.2  # [s]
 
 
@@ -58,6 +58,10 @@ class Options:
     """A second tap is right so much sooner or later than 0.8 s after the first [s]."""
     soon_cost: float = 0.0
     """Taken from the reward by a second tap that is too soon; else a hand stays at the orb."""
+    near: float = NEAR
+    """What a hand at the orb earns in each step, of what a right tap does. Much of it: it stays."""
+    least_up: float = -1.0
+    """An episode ends where the torso's up-axis has a z below this; -1: it may lie on its back."""
     substeps: int = 5
     """Physics steps in one control step."""
 
@@ -123,7 +127,7 @@ class TwoTouch:
     ) -> State:
         place, logic = task["orb"]["place"], task["orb"]["logic"]
         away = jnp.abs(readings.xpos[jnp.array(self.hands)] - place).sum(1)
-        near = NEAR * REWARD * jnp.exp(-3.0 * away).max()
+        near = self.options.near * REWARD * jnp.exp(-3.0 * away).max()
         torso = self.parts.torso
         parts = felt(self.parts, physics, readings, action)
         parts.append(jax.nn.one_hot(logic, 5))  # dm_control tells it too, but not since when
@@ -140,7 +144,7 @@ class TwoTouch:
             physics=physics,
             observation=observation,
             reward=near + earned,
-            terminated=jnp.zeros((), bool),
+            terminated=readings.xmat[torso, 2, 2] < self.options.least_up,
             truncated=jnp.zeros((), bool),
             metrics={"reward_near": near, "reward_tap": earned, "distance": away.min(), **counted},
             task=task,
