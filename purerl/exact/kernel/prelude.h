@@ -37,15 +37,18 @@
 #define SUMS(type, n, start) type sums[n]; _Pragma("unroll") for (int k = 0; k < n; ++k) sums[k] = start;
 #define SUM(k) sums[k]
 #define PUT(join, n, used, memory, to) put<n, used>(sums, memory, to, lane, join());
+#define NAMES \
+  const int lane = threadIdx.x & 31; \
+  int* const I = (int*)P; \
+  const float* const C = (const float*)C_;
 #define BEGIN \
-  const int thread = threadIdx.x % THREADS, lane = threadIdx.x & 31; \
+  const int thread = threadIdx.x % THREADS; \
   const int asked = blockIdx.x * ENVIRONMENTS + threadIdx.x / THREADS; \
   const bool there = asked < environments[0]; /* the last block's others keep step */ \
   const size_t e = there ? asked : environments[0] - 1; \
   extern __shared__ float memory_of_block[]; \
   float* const P = memory_of_block + (threadIdx.x / THREADS) * MEMORY; \
-  int* const I = (int*)P; \
-  const float* const C = (const float*)C_;
+  NAMES
 #define END
 
 #ifndef ON_A_CPU
@@ -103,18 +106,22 @@ FUNCTION int uniform(int x) {
 #define SUMS(type, n, start) type sums[n][32]; for (auto& row : sums) for (auto& x : row) x = start;
 #define SUM(k) sums[k][i & 31]
 #define PUT(join, n, used, memory, to) put<used>(sums, memory, to, join());
+#define NAMES \
+  const int lane = 0; \
+  int* const I = (int*)P; \
+  const float* const C = (const float*)C_;
 #define BEGIN \
-  const int lane = 0, thread = 0; \
+  const int thread = 0; \
   const bool there = true; \
   static thread_local float P[MEMORY]; \
-  int* const I = (int*)P; \
-  const float* const C = (const float*)C_; \
-  (void)lane; (void)thread; (void)C; (void)I; \
+  NAMES \
   for (size_t e = 0; e < (size_t)environments[0]; ++e) { \
     for (float& x : P) x = NAN;  // what is read before it is written shows
 #define END }
 
 #endif
+
+#define PART(name) ROUTINE void name(float* const P, const int thread) { NAMES
 
 FUNCTION float most(float a, float b) { return (a > b || a != a) ? a : b; }  // NaN before any number
 FUNCTION float least(float a, float b) { return (a < b || a != a) ? a : b; }

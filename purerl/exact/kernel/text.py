@@ -1,7 +1,8 @@
 """Statements as C++ that is also CUDA: `prelude.h` has the words in which the two differ."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,13 @@ from purerl.exact.kernel.values import Choice, Linear, Loop, NoRuleError, Value,
 LOCKSTEP = 8  # levels from one barrier of a block to the next: its warps share fetched code
 FEW_TERMS = 20  # a row of no more is written out, one of more is a loop
 AT_ONCE = 64  # results that lanes sum in one loop: each takes a register
+# Characters of a function: one of much more takes NVRTC five times as long. What has fewer than FEW
+# between two branches stays there.
+PART, FEW = 20_000, 2_000
 MOST_MEMORY = 1 << 16  # numbers: their places are kept in 16 bits
+
+
+OWN_NAMES = re.compile(r"\b(which|in\d+|out\d+)\b")  # of the kernel, which no part of it knows
 
 
 class Text(NamedTuple):
@@ -45,14 +52,31 @@ def written(program: Program) -> Text:
             f"for {MOST_MEMORY:,}: leave this step to XLA."
         )
     writer = _Writer(scheduler, address)
-    lines = list(writer.program(program))
+    routines, lines = in_parts(writer.program(program))
     some = (program.inputs, program.outputs)
     sizes = [[(x.size, x.kind) for x in values if x.size] for values in some]
     places, constants = writer.tables.places, writer.tables.constants
     tables = [f"TABLE unsigned short T[] = {{{_numbers(places)}}};"]
     tables += [f"TABLE unsigned int C_[] = {{{_numbers(constants, 'u')}}};"]
-    body = "\n".join([f"#define MEMORY {size}", "PRELUDE", *tables, *lines, ""])
+    body = "\n".join([f"#define MEMORY {size}", "PRELUDE", *tables, *routines, *lines, ""])
     return Text(body, size, writer.statements, *(tuple(x) for x in sizes))
+
+
+def in_parts(lines: Iterable[str]) -> tuple[list[str], list[str]]:
+    """Returns functions of what stands between loops and branches, and lines that call them."""
+    routines: list[str] = []
+    kept: list[str] = []
+    some: list[str] = []
+    for line in lines:
+        apart = line.count("{") == line.count("}") and not OWN_NAMES.search(line)
+        if not apart or sum(map(len, some)) > PART:
+            if sum(map(len, some)) > FEW:
+                name = f"part{len(routines)}"
+                routines.append("\n".join([f"PART({name})", *some, "}"]))
+                some = [f"{name}(P, thread);"]
+            kept, some = kept + some, []
+        (some if apart else kept).append(line)
+    return routines, kept + some
 
 
 def _numbers(arrays: Sequence[np.ndarray], suffix: str = "") -> str:
@@ -184,13 +208,14 @@ class _Writer(Cells):
         for start in range(0, len(rows), AT_ONCE):
             some = rows[start : start + AT_ONCE]
             count, neutral = _padded(len(some)), operations.neutral(fold, kind)
-            yield f"{self.one()} {{ SUMS({TYPES[kind]}, {count}, {neutral})"
+            lines = [f"{self.one()} {{ SUMS({TYPES[kind]}, {count}, {neutral})"]
             for (first, end), alike in itertools.groupby(enumerate(some), lambda x: x[1].place()):
                 if end > first:  # else all of its terms are 0
-                    yield f"LANES(i, {first}, {end}) {{ {self._sums(fold, kind, alike)} }}"
+                    lines.append(f"LANES(i, {first}, {end}) {{ {self._sums(fold, kind, alike)} }}")
             to = self.tables.place(np.array([self.address[x.writes[0]] + n for x, n, _ in some]))
             memory = "P" if kind == "f" else "I"
-            yield f"PUT(joined_by_{fold}, {count}, {len(some)}, {memory}, T+{to}) }}"
+            lines.append(f"PUT(joined_by_{fold}, {count}, {len(some)}, {memory}, T+{to}) }}")
+            yield "\n".join(lines)
 
     def _sums(self, fold: str, kind: str, rows: Iterator[tuple[int, _Row]]) -> str:
         """Returns C that adds a term to each of some rows, by the number of its sum."""

@@ -1,5 +1,6 @@
 """Where and when values are computed: levels, memory, what is computed before a loop."""
 
+import re
 import types
 
 import jax
@@ -10,7 +11,7 @@ from jax import lax
 
 from purerl import exact
 from purerl.exact import traces
-from purerl.exact.kernel import levels, memory, reading, schedule, statements, values
+from purerl.exact.kernel import levels, memory, reading, schedule, statements, text, values
 from purerl.exact.kernel.statements import Statement
 from tests.exact.kernel import by_one_lane, by_warps, needs_compiler
 
@@ -338,3 +339,32 @@ def test_a_trace_in_two_parts_computes_what_it_did():
     (sum_,) = traces.evaluate(second, *way, X, X, *taken)
     for found, right in zip((c, sum_, cosine, three, same), whole(X, X), strict=True):
         np.testing.assert_array_equal(found, right)
+
+
+def test_what_stands_between_branches_is_cut_into_functions_that_know_its_names():
+    """Free. Called in their places they do what the lines did, in their order."""
+    line = "ONE(0) { const float x = P[1]; P[2] = x; }"
+    copied, tested = (
+        "FEW(0, i, 4) { P[i] = in0[e*4+i]; }",
+        "int which; { which = 1; } if (!which) break;",
+    )
+    lines = [
+        copied,
+        *[line] * 1500,
+        "for (;;) {",
+        tested,
+        line,
+        "SYNC;",
+        "}",
+        *[line, "LOCKSTEP;"] * 60,
+        "END }",
+    ]
+    routines, kept = text.in_parts(lines)
+    again = []
+    for one in kept:
+        number = re.match(r"part(\d+)\(P, thread\);", one)
+        again += routines[int(number[1])].splitlines()[1:-1] if number else [one]
+    assert again == lines and len(kept) < 40
+    for number, routine in enumerate(routines):
+        assert routine.startswith(f"PART(part{number})\n") and len(routine) < 1.05 * text.PART
+        assert "in0" not in routine and "which" not in routine
