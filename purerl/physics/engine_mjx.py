@@ -30,7 +30,7 @@ _OF_SENSORS = ("sensordata", "cacc", "cfrc_int", "cfrc_ext")
 # of a humanoid has 8,181. A rodent's kernel is 1.5 times as fast as XLA's and takes two minutes to
 # make, where `warp` is 3 to 4 times as fast as that (lab/2026-11-29-half-the-memory.md).
 MOST_OF_A_KERNEL = 10_000
-TRIED, TRIED_FOR = 64, 12  # simulations and control steps on which a kernel is compared with XLA
+TRIED, TRIED_FOR = 32, 12  # simulations and control steps on which a kernel is compared with XLA
 
 
 class JaxEngine:
@@ -123,7 +123,8 @@ class JaxEngine:
         """
         state, ctrl, changes = example
         quickly = {"xla_backend_optimization_level": 0} if self._apart else None
-        by_xla = jax.jit(jax.vmap(step), compiler_options=quickly)
+        in_turn = lambda *args: jax.lax.map(lambda x: step(*x), args)  # noqa: E731
+        by_xla = jax.jit(in_turn, compiler_options=quickly)  # a `vmap` would be traced for seconds
         rng = np.random.default_rng(0)
 
         def several(x: Any, like: Any) -> np.ndarray:

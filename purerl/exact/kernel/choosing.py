@@ -55,20 +55,20 @@ def with_kernel(
 
 def _tried(f: Callable, reached: Callable, example: tuple) -> tuple[compiling.Kernel | None, str]:
     """Returns a kernel that may be used, or None, and what `with_kernel` says."""
-    # What is traced around this call is no business of the comparison: a thread has no trace. It
-    # begins when the text is written: both are Python, which one thread at a time executes.
+    # What is traced around this call is no business of the comparison: a thread has no trace. XLA
+    # compiles there while a new text is written.
     with concurrent.futures.ThreadPoolExecutor(2) as threads:
         try:
             traced = compiling.traced(f, *example)
-            kernel = compiling.kernel_of(traced)
+            by_xla = functools.cache(functools.partial(threads.submit, reached, traced, *example))
+            kernel = compiling.kernel_of(traced, meanwhile=by_xla)
             by = f"NVRTC {compilers.nvrtc_version()}" if jax.default_backend() == "gpu" else "g++"
             block = compilers.block_of(kernel.text, launch.capability())
             if (fit := block.environments) < FEWEST:
                 said = f"a block of this GPU has room for {fit} environments, of {FEWEST}"
                 return None, f"XLA: {said}"
             whole = compilers.source(kernel.text, block)
-            by_xla = functools.partial(reached, traced, *example)
-            compare = functools.partial(_compared, kernel, by_xla, threads.submit)
+            compare = functools.partial(_compared, kernel, by_xla)
             found = threads.submit(_known_agreement, whole, by, compare).result()
         except (compiling.NoRuleError, compilers.CompilerError) as error:
             return None, f"XLA: {error}"
@@ -86,11 +86,10 @@ def _known_agreement(whole: str, by: str, compare: Callable) -> compiling.Agreem
     return compiling.Agreement(*json.loads(path.read_text()))
 
 
-def _compared(kernel: compiling.Kernel, by_xla: Callable, submit: Callable) -> compiling.Agreement:
-    on_gpu = jax.default_backend() == "gpu"
-    ptx = submit(compilers.for_gpu, kernel.text, launch.capability()) if on_gpu else None
-    args, wanted = by_xla()  # beside NVRTC
-    if ptx:
-        ptx.result()
+def _compared(kernel: compiling.Kernel, by_xla: Callable) -> compiling.Agreement:
+    wait = by_xla().result
+    if jax.default_backend() == "gpu":
+        compilers.for_gpu(kernel.text, launch.capability())  # NVRTC compiles beside XLA
+    args, wanted = wait()
     found = jax.jit(jax.vmap(kernel))(*args)
     return compiling.agreement(*map(compiling.as_rows, (found, wanted)))

@@ -101,9 +101,12 @@ def compile_kernel(f: Callable, *example: Any) -> Kernel:
     return kernel_of(traced(f, *example))
 
 
-def kernel_of(traced: Traced) -> Kernel:
-    """Returns a traced function as one kernel."""
-    return Kernel(_written(traced.closed), traced.shapes, traced.inputs)
+def kernel_of(traced: Traced, meanwhile: Callable[[], Any] = lambda: None) -> Kernel:
+    """Returns a traced function as one kernel.
+
+    `meanwhile` is called before a text is written, which takes seconds, and not if one is kept.
+    """
+    return Kernel(_written(traced.closed, meanwhile), traced.shapes, traced.inputs)
 
 
 def kernel_missing(f: Callable, *example: Any) -> list[Missing]:
@@ -111,13 +114,14 @@ def kernel_missing(f: Callable, *example: Any) -> list[Missing]:
     return reading.missing(traced(f, *example).closed)
 
 
-def _written(closed: core.ClosedJaxpr) -> text.Text:
+def _written(closed: core.ClosedJaxpr, meanwhile: Callable[[], Any]) -> text.Text:
     """Returns the text of a trace, which is kept: to write it takes longer than to trace it."""
     numbers = hashlib.sha256(compilers.how_texts_are_written())
     for x in map(np.asarray, traces.constants(closed)):  # a trace's words have not all of them
         numbers.update(f"{x.dtype}{x.shape}".encode() + x.tobytes())
 
     def make(_: str) -> bytes:
+        meanwhile()
         return json.dumps(text.written(reading.read(closed))).encode()
 
     path = compilers.kept(str(closed), (numbers.hexdigest(),), "text.json", make)
