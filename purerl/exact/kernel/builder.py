@@ -198,10 +198,7 @@ class Builder:
         return self.take(half, index.reshape(fold.shape))
 
     def _packed(self, fold: values.Fold) -> Value | None:
-        """Returns a fold without most of its terms that are known to be 0; None if they are few.
-
-        Rows of about as many other terms are made one fold.
-        """
+        """Returns a fold without most known zeros, its like rows as one; None if they are few."""
         if fold.op != "add" or fold.arg.size < MANY_TERMS:
             return None
         zero = self.zeros.of(fold.arg).reshape(fold.size, fold.terms)

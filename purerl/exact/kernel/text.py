@@ -1,8 +1,7 @@
 """Statements as C++ that is also CUDA: `prelude.h` has the words in which the two differ."""
 
 import itertools
-import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from purerl.exact.kernel import lanes, memory, operations, side_by_side
 from purerl.exact.kernel.cells import TYPES, Cells
 from purerl.exact.kernel.lanes import LANES
+from purerl.exact.kernel.parts import in_parts
 from purerl.exact.kernel.reading import Program
 from purerl.exact.kernel.schedule import Scheduler
 from purerl.exact.kernel.statements import Code, Plan, Statement, StepStatement, needed_at_last
@@ -19,13 +19,7 @@ from purerl.exact.kernel.values import Choice, Linear, Loop, NoRuleError, Value,
 LOCKSTEP = 8  # levels from one barrier of a block to the next: its warps share fetched code
 FEW_TERMS = 20  # a row of no more is written out, one of more is a loop
 AT_ONCE = 64  # results that lanes sum in one loop: each takes a register
-# Characters of a function: one of much more takes NVRTC five times as long. What has fewer than FEW
-# between two branches stays there.
-PART, FEW = 20_000, 2_000
 MOST_MEMORY = 1 << 16  # numbers: their places are kept in 16 bits
-
-
-OWN_NAMES = re.compile(r"\b(which|in\d+|out\d+)\b")  # of the kernel, which no part of it knows
 
 
 class Text(NamedTuple):
@@ -60,23 +54,6 @@ def written(program: Program) -> Text:
     tables += [f"TABLE unsigned int C_[] = {{{_numbers(constants, 'u')}}};"]
     body = "\n".join([f"#define MEMORY {size}", "PRELUDE", *tables, *routines, *lines, ""])
     return Text(body, size, writer.statements, *(tuple(x) for x in sizes))
-
-
-def in_parts(lines: Iterable[str]) -> tuple[list[str], list[str]]:
-    """Returns functions of what stands between loops and branches, and lines that call them."""
-    routines: list[str] = []
-    kept: list[str] = []
-    some: list[str] = []
-    for line in lines:
-        apart = line.count("{") == line.count("}") and not OWN_NAMES.search(line)
-        if not apart or sum(map(len, some)) > PART:
-            if sum(map(len, some)) > FEW:
-                name = f"part{len(routines)}"
-                routines.append("\n".join([f"PART({name})", *some, "}"]))
-                some = [f"{name}(P, thread);"]
-            kept, some = kept + some, []
-        (some if apart else kept).append(line)
-    return routines, kept + some
 
 
 def _numbers(arrays: Sequence[np.ndarray], suffix: str = "") -> str:

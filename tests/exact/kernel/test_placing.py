@@ -11,7 +11,7 @@ from jax import lax
 
 from purerl import exact
 from purerl.exact import traces
-from purerl.exact.kernel import levels, memory, reading, schedule, statements, text, values
+from purerl.exact.kernel import levels, memory, parts, reading, schedule, statements, values
 from purerl.exact.kernel.statements import Statement
 from tests.exact.kernel import by_one_lane, by_warps, needs_compiler
 
@@ -359,12 +359,12 @@ def test_what_stands_between_branches_is_cut_into_functions_that_know_its_names(
         *[line, "LOCKSTEP;"] * 60,
         "END }",
     ]
-    routines, kept = text.in_parts(lines)
+    routines, kept = parts.in_parts(lines)
     again = []
     for one in kept:
         number = re.match(r"part(\d+)\(P, thread\);", one)
         again += routines[int(number[1])].splitlines()[1:-1] if number else [one]
     assert again == lines and len(kept) < 40
     for number, routine in enumerate(routines):
-        assert routine.startswith(f"PART(part{number})\n") and len(routine) < 1.05 * text.PART
+        assert routine.startswith(f"PART(part{number})\n") and len(routine) < 1.05 * parts.MOST
         assert "in0" not in routine and "which" not in routine
