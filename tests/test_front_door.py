@@ -231,6 +231,6 @@ def test_the_list_of_experiments_is_what_a_newcomer_wants_to_see():
         "rodent_two_touch", "rodent_joystick",
         "ant_intention", "humanoid_imitation", "rodent_imitation", "rodent_intention",
         "ant_gaps_reuse", "rodent_gaps_reuse",
-        "suite", "suite_gpu", "suite_humanoid", "custom_network",
+        "suite", "suite_gpu", "suite_humanoid", "humanoid_run", "custom_network",
     ]  # fmt: skip
     assert all(len(summary(available()[name])) < 90 for name in names)
