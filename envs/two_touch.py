@@ -21,7 +21,7 @@ from purerl.envs.touch import touched
 
 BEFORE, ONCE, TWICE, TOO_SOON, TOO_LATE = range(5)
 HEIGHT, AREA = 0.14, 1.5  # of the orb: above the ground, +- from the middle [m]
-REWARD, NEAR = 25.0, 0.01  # dm_control's: for each right tap; its share that a hand near it earns
+REWARD, NEAR = 25.0, 0.01  # dm_control's: for a right tap; its share, each step, for being near
 INTERVAL, TOLERANCE, DEBOUNCE, TIMEOUT = 0.8, 0.1, 0.2, 1.2  # [s]
 
 
@@ -59,9 +59,10 @@ class Options:
     soon_cost: float = 0.0
     """Taken from the reward by a second tap that is too soon; else a hand stays at the orb."""
     near: float = NEAR
-    """What a hand at the orb earns in each step, of what a right tap does. Much of it: it stays."""
-    least_up: float = -1.0
-    """An episode ends where the torso's up-axis has a z below this; -1: it may lie on its back."""
+    """Earned in each step by a hand at the orb, as a share of a right tap's 25. Where it is large,
+    the hand stays."""
+    least_up: float = -2.0
+    """An episode ends where the torso's up-axis has a z below this; -2: never."""
     substeps: int = 5
     """Physics steps in one control step."""
 

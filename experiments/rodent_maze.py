@@ -10,14 +10,22 @@ on its feet; in 7% of the episodes it lies on its back, and finds half as many. 
 
 import dataclasses
 
+from purerl import Evaluation, Experiment, networks
 from purerl.envs import maze_forage, sight
-from purerl.experiments import rodent_two_touch
+from purerl.experiments import rodent_run
 
-other = rodent_two_touch.experiment
-experiment = dataclasses.replace(
-    other,
+experiment = Experiment(
     build_env=maze_forage.build,
     # Treats alone are too rare to learn to walk from.
     env=maze_forage.Options(eyes=sight.Sight(number=0), forward_weight=0.5),
-    ppo=dataclasses.replace(other.ppo, num_steps=9_000_000, num_envs=512, rollout_length=32),
+    build_network=networks.mlp,
+    network=rodent_run.experiment.network,
+    ppo=dataclasses.replace(
+        rodent_run.experiment.ppo,
+        num_steps=9_000_000,
+        num_envs=512,
+        rollout_length=32,
+        episode_length=1500,  # 30 s
+    ),
+    evaluation=Evaluation(num_episodes=32, number=8),
 )

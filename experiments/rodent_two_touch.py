@@ -3,8 +3,9 @@
 python -m purerl.run rodent_two_touch --engine warp --num-seeds 3
 
 Expected: 18 and 19 orbs in 30 s, 79 and 93% of their second taps at the right time, two of three
-seeds after 12.9 M steps, 20 min on half an H200; the third seed taps 12, too late. Without a memory
-(`networks.mlp`) three seeds tap 9 to 13 too late. It rears to tap, and stands on its feet between.
+seeds after 12.9 M steps, 20 min on a third of an H200; the third seed taps 12, a second time too
+late. Without a memory (`networks.mlp`) three seeds tap 8 or 9 orbs, most of them too late. It rears
+to tap, and stands on its feet between.
 
 It is told where the orb is, but not when it was tapped. dm_control's reward for being near is five
 times as much; with that it lies on its back, all feet at the orb, and waits.

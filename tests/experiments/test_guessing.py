@@ -7,6 +7,7 @@ import optax
 import pytest
 
 from purerl import eyes, networks
+from purerl.experiment.loading import find
 from purerl.experiments import guessing
 
 SIZES = networks.MlpOptions(policy_hidden=(8,), value_hidden=(8,), std="state")
@@ -116,3 +117,17 @@ def test_what_no_network_can_be_made_of_is_refused():
         guessing.guess(OPTIONS, jnp.zeros(3), ACTIONS)
     with pytest.raises(ValueError, match="features is 0, hidden 128; a layer has at least 1 unit"):
         guessing.Options(features=0)
+
+
+@pytest.mark.parametrize(
+    "one", ["rodent_maze_eyes", "rodent_gaps_eyes", "rodent_gaps_reuse", "ant_gaps_reuse"]
+)
+def test_a_run_of_the_other_experiment_has_the_parts_that_one_takes(one):
+    """1 s: shapes alone."""
+    entries = ("policy", "privileged", "reference", "proprioception")
+    example = {name: jnp.zeros(6) for name in entries}
+    for name, part in find(one).parts.items():
+        other = find(part.run)
+        network = other.build_network(other.network, example, ACTIONS)
+        params, _ = jax.eval_shape(network.init, jax.random.key(0))
+        assert name in params["params"], (name, part.run)

@@ -191,7 +191,7 @@ class Builder:
         """Returns a symmetric square of sums, which a Hessian is, made of its lower half."""
         some, index = np.unique(lanes.lower_rows(n), return_inverse=True)
         arg = self.pick(fold.arg, fold.arg.places.reshape(-1, fold.terms)[some])
-        shared = fold.terms >= lanes.LANES and n <= lanes.WIDEST
+        shared = lanes.are_shared(some.size, fold.terms, n)
         new = values.Fold(some.shape, fold.kind, self.top, fold.op, arg, fold.terms, shared)
         packed = None if shared else self._packed(new)
         half = packed or self._once(("half", id(arg)), new, [arg])

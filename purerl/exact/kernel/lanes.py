@@ -19,15 +19,15 @@ from purerl.exact.kernel.values import Fold, Map, Value, View
 
 LANES = 32  # of a warp, which computes one environment
 FEW_ROWS = 16  # of a fold whose rows the lanes share; of more rows each has a lane
-WIDEST = 32  # a square of sums, such as a Hessian, is shared too, if it has no more columns
+WIDEST = 32  # a symmetric square, such as a Hessian, is shared too, if it has no more columns
 # A row has the terms of a longer one, to read the same numbers, if it needs more than this share of
 # the longer one's rounds.
 SHORTEST = 0.6
 
 
-def are_shared(rows: int, terms: int) -> bool:
-    """Tells whether the lanes share each of some rows, which are no square."""
-    return terms >= LANES and rows <= FEW_ROWS
+def are_shared(rows: int, terms: int, n: int = 0) -> bool:
+    """Tells whether the lanes share each of some rows; n: of a symmetric square [n, n]."""
+    return terms >= LANES and (rows <= FEW_ROWS or 0 < n <= WIDEST)
 
 
 def width_of(fold: Fold) -> int:
