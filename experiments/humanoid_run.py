@@ -30,6 +30,12 @@ class Options:
     min_std: float = 0.1
     """Their least scale, to which what is learned is added."""
 
+    def __post_init__(self) -> None:
+        """Raises ValueError for what the default network refuses, too."""
+        networks.MlpOptions(
+            policy_hidden=self.hidden, initial_std=self.initial_std, min_std=self.min_std
+        )
+
 
 class Tower(nn.Module):
     """As `intention.Tower`, with another initializer; [..., O] to [..., last width]."""

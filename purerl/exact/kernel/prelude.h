@@ -40,7 +40,8 @@
 #define NAMES \
   const int lane = threadIdx.x & 31; \
   int* const I = (int*)P; \
-  const float* const C = (const float*)C_;
+  const float* const C = (const float*)C_; \
+  (void)lane; (void)I; (void)C;
 #define BEGIN \
   const int thread = threadIdx.x % THREADS; \
   const int asked = blockIdx.x * ENVIRONMENTS + threadIdx.x / THREADS; \
@@ -109,7 +110,8 @@ FUNCTION int uniform(int x) {
 #define NAMES \
   const int lane = 0; \
   int* const I = (int*)P; \
-  const float* const C = (const float*)C_;
+  const float* const C = (const float*)C_; \
+  (void)lane; (void)I; (void)C;
 #define BEGIN \
   const int thread = 0; \
   const bool there = true; \
