@@ -70,7 +70,12 @@ def product(params: dict, left: Array, right: Array) -> Array:
     axes = ((b + 1,), (b,)), (tuple(range(b)),) * 2
     left, right = lax.optimization_barrier((left, right))
     plain: Any = lax.dot_general_p.bind(left, right, **params | {"dimension_numbers": axes})
-    return lax.reshape(lax.optimization_barrier(plain), (*batch, *m, *n))
+    plain = lax.optimization_barrier(plain)
+    if jnp.issubdtype(plain.dtype, jnp.floating):
+        # As it is: but where its transpose is wanted, XLA would compute that by Eigen.
+        bits = jnp.finfo(plain.dtype)
+        plain = lax.reduce_precision(plain, bits.nexp, bits.nmant)
+    return lax.reshape(plain, (*batch, *m, *n))
 
 
 def factor(params: dict, matrix: Array) -> Array:

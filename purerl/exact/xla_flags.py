@@ -36,10 +36,11 @@ FIXING_FLAGS = (
     "xla_gpu_exclude_nondeterministic_ops=true",
 )
 # On a CPU, what asks the processor what it can do, or how large its caches are, is left out:
-# instructions beyond AVX2; approximate reciprocals, which each maker rounds otherwise; YNNPACK and
-# XNNPACK. Other libraries are left out by `portable.py`.
+# instructions beyond AVX, since LLVM fuses a product with a sum (FMA came with AVX2) or does not by
+# what it knows of a processor's model; approximate reciprocals, which each maker rounds otherwise;
+# YNNPACK and XNNPACK. Other libraries are left out by `portable.py`.
 PORTABLE = {
-    "xla_cpu_max_isa": "AVX2",
+    "xla_cpu_max_isa": "AVX",
     "xla_cpu_multi_thread_eigen": "false",
     "xla_cpu_enable_platform_dependent_math": "false",
     "xla_cpu_use_xnnpack": "false",

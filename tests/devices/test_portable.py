@@ -89,7 +89,7 @@ def test_where_portable_bits_cannot_be_had_is_one_line(tmp_path, monkeypatch):
     refused("JAX has begun with other flags")
     monkeypatch.setattr(xla_flags, "jax_has_begun", lambda: False)
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_max_isa=SSE4_2")
-    refused("XLA_FLAGS has --xla_cpu_max_isa=SSE4_2; portable bits need --xla_cpu_max_isa=AVX2")
+    refused("XLA_FLAGS has --xla_cpu_max_isa=SSE4_2; portable bits need --xla_cpu_max_isa=AVX:")
     old = {"flags": "fpu avx fma", "model name": "An old one"}
     monkeypatch.setattr(manifest, "processor", old.get)
     refused(r"AVX2 and FMA, and this one \(An old one\) has not both; leave out --portable")
