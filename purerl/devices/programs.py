@@ -78,6 +78,9 @@ def compile_programs(
         init, judge, policy = jax.vmap(init), jax.vmap(judge), jax.vmap(policy)
         key = jax.random.split(key, vmapped_seeds)
     with compilation.no_collection():
+        begin, evaluate = compilation.jit("init", init), compilation.jit("evaluation", judge)
+        # First: it has no step, so on a GPU it is compiled while a kernel is made of one.
+        beginning = compilation.start("init", begin.trace(key)) if fresh else None
         abstract = jax.eval_shape(init, key)
         task = (config, env, network, abstract)
         if shards.number > 1:
@@ -85,8 +88,6 @@ def compile_programs(
         else:
             in_halves = calls_host or jax.default_backend() == "gpu"
             compiling = compile_update(*task, vmapped_seeds > 1, in_halves)
-        begin, evaluate = compilation.jit("init", init), compilation.jit("evaluation", judge)
-        beginning = compilation.start("init", begin.trace(key)) if fresh else None
         if evaluation.number:
             evaluate = compilation.when_needed("evaluation", evaluate, compiling.judged)
         update, seconds = compiling.finish()
