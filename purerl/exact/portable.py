@@ -16,8 +16,9 @@ from jax.extend import core
 
 from purerl.exact import rewriting, traces, walk
 
-LAPACK = {"lu", "geqrf", "geqp3", "householder_product", "ormqr", "eig", "eigh", "svd"}
-LAPACK |= {"schur", "sylvester", "hessenberg", "tridiagonal", "tridiagonal_solve"}
+OF_LIBRARIES = {"conv_general_dilated", "ragged_dot_general"}
+OF_LIBRARIES |= {"lu", "geqrf", "geqp3", "householder_product", "ormqr", "eig", "eigh", "svd"}
+OF_LIBRARIES |= {"schur", "sylvester", "hessenberg", "tridiagonal", "tridiagonal_solve"}
 
 
 class LibraryError(RuntimeError):
@@ -48,7 +49,7 @@ def _beyond(
     for eqn in closed.jaxpr.eqns:
         name, place = eqn.primitive.name, traces.source(eqn)
         place = around if around and "/jax/_src/" in place else place
-        if name in LAPACK or (name in REPLACED and not (reached and _wants(eqn))):
+        if name in OF_LIBRARIES or (name in REPLACED and not (reached and _wants(eqn))):
             yield name, place
         for sub in traces.sub_jaxprs(eqn):
             yield from _beyond(sub, place, reached and (name in traces.CALLS or name in walk.LOOPS))

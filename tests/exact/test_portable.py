@@ -122,6 +122,7 @@ def test_a_matrix_that_is_not_positive_has_no_factor():
         (lambda x: lax.map(jnp.linalg.svd, x[None])[0], "svd"),
         (lambda x: jnp.linalg.solve(x, x[0]), "lu"),
         (lambda x: jnp.linalg.cholesky(x + 1j).real, "cholesky"),
+        (lambda x: lax.conv(x[None, None], x[None, None], (1, 1), "SAME"), "conv_general_dilated"),
     ],
 )
 def test_what_only_a_library_computes_is_named(function, named):
