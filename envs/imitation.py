@@ -197,8 +197,9 @@ class Imitation:
 def record(parts: Parts, held: clips.Clips) -> Recording:
     """Returns clips, a frame for each control step, as an environment holds them."""
     places = [clips.kinematics(parts.model, np.asarray(track)) for track in held.qpos]
-    names = [clips.bare(parts.model.body(i).name) for i in (parts.torso, *parts.bodies)]
-    numbers = [places[0][0].index(name) for name in names]
+    # By number: some have no name. `kinematics` has the whole body's parts in their order.
+    own = np.flatnonzero(parts.model.body_rootid == parts.model.body_rootid[parts.torso])
+    numbers = np.searchsorted(own, (parts.torso, *parts.bodies))
     where = jnp.asarray(np.stack([place[:, numbers] for _, place in places]), jnp.float32)
     return Recording(held.qpos, held.qvel, where[:, :, 0], where[:, :, 1:, :3], held.lengths)
 

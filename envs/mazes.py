@@ -55,12 +55,14 @@ def draw_maze(key: Array, maze: Maze) -> Drawn:
     tree_key, room_key, place_key = jax.random.split(key, 3)
     rooms = draw_rooms(room_key, maze)
     free = spanning_tree(tree_key, maze.cells) | rooms.any(0)
-    # In each room the cells of the highest scores that no room before it has taken.
+    # In each room the cells of the highest scores that no room before it has taken; if it has too
+    # few of its own, since rooms overlap, others that are free.
     score = jax.random.uniform(place_key, (maze.cells, maze.cells))
     taken, chosen = jnp.zeros_like(free), []
     for number in range(maze.rooms):
         wanted = maze.targets_per_room + (number == 0)
-        _, best = jax.lax.top_k(jnp.where(rooms[number] & ~taken, score, -1.0).ravel(), wanted)
+        ranked = jnp.where(rooms[number], score, score - 1.0)
+        _, best = jax.lax.top_k(jnp.where(free & ~taken, ranked, -2.0).ravel(), wanted)
         chosen.append(best)
         taken = taken.ravel().at[best].set(True, unique_indices=True).reshape(taken.shape)
     index = jnp.concatenate(chosen)

@@ -25,7 +25,8 @@ def draw(key: Array, weights: Array, lengths: Array, window: int) -> tuple[Array
 
     Args:
       key: [] typed.
-      weights: [C] in proportion to how often each clip is drawn; 0: never.
+      weights: [C] in proportion to how often each clip is drawn; 0, below or NaN: never. With
+        none above 0, each clip is drawn as often.
       lengths: [C] int32 frames of each clip, none below `window`; see `check_window`.
       window: frames that are needed from the first one on, that one among them.
 
@@ -35,6 +36,8 @@ def draw(key: Array, weights: Array, lengths: Array, window: int) -> tuple[Array
     clip_key, frame_key = jax.random.split(key)
     # Whole numbers, whose sum is below 2^30 whatever the order in which it is made.
     most = 2**30 // len(weights) - 1
+    weights = jnp.where(weights > 0.0, weights, 0.0)
+    weights = jnp.where(jnp.any(weights > 0.0), weights, 1.0)
     units = jnp.ceil(weights / jnp.max(weights) * most).astype(jnp.int32)
     ends = jnp.cumsum(units)
     clip = jnp.sum(ends <= jax.random.randint(clip_key, (), 0, ends[-1]), dtype=jnp.int32)

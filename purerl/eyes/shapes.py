@@ -22,6 +22,7 @@ _GEOM = mujoco.mjtGeom
 FIELD = _GEOM.mjGEOM_HFIELD
 Vector = Sequence[Array]  # x, y and z
 UP = np.array([0.0, 0.0, 1.0], np.float32)
+ENDLESS = 1e10  # half of what a plane of size 0 has [m]
 
 
 class Kind(NamedTuple):
@@ -88,7 +89,9 @@ def _enter_box(o: Vector, d: Vector, length: Array) -> Array:
 
 
 def _enter_plane(o: Vector, d: Vector, length: Array) -> Array:
-    return _ahead(-o[2] / d[2], (o[2] > 0.0) & (d[2] < 0.0))
+    t = -o[2] / d[2]
+    within = [jnp.abs(p + t * x) <= 1.0 for p, x in zip(o[:2], d[:2], strict=True)]
+    return _ahead(t, (o[2] > 0.0) & (d[2] < 0.0) & within[0] & within[1])
 
 
 def _surface(heights: Array, x: Array, y: Array) -> tuple[Array, Array, Array]:
@@ -162,7 +165,9 @@ def _normal_of_field(p: Array, heights: Array) -> Array:
 # In this order shapes stand in a scene. Boxes are last: those of an episode follow the model's.
 KINDS = {
     _GEOM.mjGEOM_PLANE: Kind(
-        np.ones_like, _enter_plane, lambda p, _: jnp.broadcast_to(UP, p.shape)
+        lambda s: np.array([s[0] or ENDLESS, s[1] or ENDLESS, 1.0]),
+        _enter_plane,
+        lambda p, _: jnp.broadcast_to(UP, p.shape),
     ),
     FIELD: Kind(lambda s: s, _enter_field, _normal_of_field),  # heights in place of a length
     _GEOM.mjGEOM_SPHERE: Kind(lambda s: s[[0, 0, 0]], _enter_ball, lambda p, _: p),

@@ -25,7 +25,7 @@ class Config:
     # Where the goal is reached soon, a start is what is to be learned.
     shortest_episode: int = 32
     """Time limit of the first environment's training episodes [control steps]; the others' rise
-    to `episode_length`, evenly in their logarithm. 0: all have the limit `episode_length`."""
+    to `episode_length`, evenly in their logarithm. 0, or one environment: whole ones."""
     gamma: float = 0.99
     """Discount of one control step."""
     gae_lambda: float = 0.95

@@ -24,7 +24,7 @@ def time_limits(config: Config, env_ids: Array) -> Array:
       config: the shortest limit, and the whole one.
       env_ids: [B] int32.
     """
-    if not 0 < config.shortest_episode < config.episode_length:
+    if config.num_envs == 1 or not 0 < config.shortest_episode < config.episode_length:
         return jnp.full(env_ids.shape, config.episode_length, jnp.int32)
     # Spaced over all environments, of which those of `env_ids` may be a part.
     spaced = np.geomspace(config.shortest_episode, config.episode_length, config.num_envs)

@@ -45,7 +45,8 @@ def evaluate_policy(
 
     Returns:
       "episode_return", "episode_length" and every metric of the environment, name -> [N], and
-      "lost" [N], 1 for an episode that ended because its state was no longer finite.
+      "lost" [N], 1 for an episode that ended because its state was no longer finite: what it
+      counted (`*_count`) is 0.
 
     >>> length = config.episode_length
     >>> judge = functools.partial(purerl.evaluate_policy, env, network, episode_length=length)
@@ -76,7 +77,10 @@ def evaluate_policy(
 
 def results(end: Progress) -> Metrics:
     """Returns the figures of N episodes that are over, name -> [N], as `evaluate_policy`."""
-    return episodes.episode_metrics(end.episode) | {
+    found = episodes.episode_metrics(end.episode)
+    # A success may be counted from the first step on, and taken back at the end: which is missing.
+    found |= {k: jnp.where(end.lost, 0.0, x) for k, x in found.items() if k.endswith("_count")}
+    return found | {
         "episode_return": end.episode.episode_return,
         "episode_length": end.episode.length.astype(jnp.float32),
         "lost": end.lost.astype(jnp.float32),

@@ -57,7 +57,8 @@ def next_rate(config: Config, rate: Array, kl: Array, sound: Array) -> Array:
     """Returns the learning rate after a minibatch whose policy had moved by `kl` [].
 
     The adaptive schedule of Schulman et al. 2017 (section 4), applied to the learning rate: a
-    factor 1.5 down above twice the desired KL, up below half of it, within [1e-5, 1e-2].
+    factor 1.5 down above twice the desired KL, up below half of it, within [1e-5, 1e-2]. A first
+    rate outside moves towards it alone.
 
     Args:
       config: the schedule.
@@ -67,8 +68,8 @@ def next_rate(config: Config, rate: Array, kl: Array, sound: Array) -> Array:
     """
     if config.schedule != "adaptive_kl":
         return rate
-    down = jnp.maximum(rate / 1.5, 1e-5)
-    up = jnp.minimum(rate * 1.5, 1e-2)
+    down = jnp.minimum(rate, jnp.maximum(rate / 1.5, 1e-5))
+    up = jnp.maximum(rate, jnp.minimum(rate * 1.5, 1e-2))
     moved = jnp.where(kl < 0.5 * config.desired_kl, up, rate)
     moved = jnp.where(kl > 2.0 * config.desired_kl, down, moved)
     return jnp.where(sound, moved, rate)

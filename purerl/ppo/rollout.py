@@ -105,12 +105,11 @@ def rollout(
     state = state.replace(discounted_return=end.discounted_return)
     # The next row's value is that of s'_t, unless an episode ended. Where one terminated or was
     # lost, `gae` does not read it.
-    following = jnp.concatenate([transitions.value[1:], output.value[None]])
     # A state that is lost in its next step is taught no value: what bootstrapped from it would rise
-    # for ever. So that step is left out: what follows the one before is a new episode's start.
-    then = jnp.concatenate([following[1:], following[-1:]])
-    lost_next = jnp.concatenate([~transitions.valid[1:], jnp.zeros_like(transitions.valid[:1])])
-    following = jnp.where(lost_next, then, following)
+    # for ever. So such steps are left out: what follows the one before is a new episode's start.
+    # A start that is no number has no value.
+    back = lambda then, row: (jnp.where(row.valid, row.value, then), then)  # noqa: E731
+    _, following = jax.lax.scan(back, jnp.nan_to_num(output.value), transitions, reverse=True)
     # Where one was truncated, its step has kept V(s'_t), whatever becomes of the next episode.
     following = jnp.where(transitions.truncated, transitions.next_value, following)
     return state, transitions._replace(next_value=following), end.sums

@@ -92,6 +92,12 @@ def test_clips_are_drawn_by_their_weights_and_frames_with_a_whole_window():
     assert (draws(2 * weights, lengths, 5)[0] == clip).all()
 
 
+def test_a_weight_that_is_none_draws_no_clip_that_is_not_there():
+    lengths = jnp.array([9, 5, 8])
+    assert set(draws(jnp.array([1.0, jnp.nan, 1.0]), lengths, 5)[0]) == {0, 2}
+    assert set(draws(jnp.zeros(3), lengths, 5)[0]) == {0, 1, 2}
+
+
 def test_no_number_draws_a_clip_of_weight_zero(monkeypatch):
     weights, lengths = jnp.array([0.0, 1.0, 3.0, 0.0]), jnp.array([9, 5, 8, 9])
     for clip, number in ((1, lambda key, shape, low, high: low), (2, lambda *of: of[-1] - 1)):

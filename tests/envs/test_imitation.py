@@ -265,6 +265,16 @@ def test_a_set_is_a_side_a_behaviour_or_a_clip(place):
     assert sorted(sum(sides, ())) == ["Rear_2", "Walk_1"] and all(sides)
 
 
+def test_bodies_without_a_name_are_compared_with_their_own_places(place, env):
+    unnamed = XML.replace('<body name="walker/torso"', "<body").replace(
+        '<body name="walker/leg"', "<body"
+    )
+    (place / "unnamed.xml").write_text(unnamed)
+    found = imitation.build(options(place, body=str(place / "unnamed.xml")), "c").recording
+    assert np.array_equal(found.bodies, env.recording.bodies)
+    assert np.array_equal(found.torso, env.recording.torso)
+
+
 BALL = XML.replace('axis="0 1 0" range="-120 10" limited="true"', 'type="ball"')
 BALL = BALL.replace('<motor joint="walker/knee" ctrlrange="-1 1"/>', "")
 

@@ -60,6 +60,21 @@ def test_targets_and_the_start_are_free_cells_of_their_own(drawn):
     assert one.start.std(axis=0).min() > 0.5
 
 
+def test_a_treat_is_not_in_a_wall_where_rooms_have_too_few_cells_of_their_own():
+    """One of 3,000 mazes; with twelve rooms one of ten."""
+    for maze, key in (
+        (Maze(), jax.random.split(jax.random.key(0), 10000)[1783]),
+        (Maze(rooms=12), jax.random.key(0)),
+    ):
+        keys = jnp.concatenate([key[None], jax.random.split(jax.random.clone(key), 63)])
+        one = jax.jit(jax.vmap(lambda k, maze=maze: mazes.draw_maze(k, maze)))(keys)
+        cells = np.concatenate([one.start[:, None], one.targets], axis=1) / maze.cell
+        cells = np.round(cells + (maze.cells - 1) / 2).astype(int)
+        for free, mine in zip(np.asarray(one.free), cells, strict=True):
+            assert free[mine[:, 0], mine[:, 1]].all()
+            assert len(np.unique(mine, axis=0)) == 1 + maze.targets
+
+
 def test_walls_near_are_all_that_a_body_can_touch(drawn):
     """Every wall cell within 0.24 m of a free place is in the window."""
     maze, one = drawn

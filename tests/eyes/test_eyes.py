@@ -15,6 +15,8 @@ from tests import quick
 
 KINDS = {
     "plane": '<geom type="plane" size="0 0 1" pos="0 0 -.4" euler="5 3 0"/>',
+    "tile": '<geom type="plane" size=".3 .2 1" pos=".1 0 0" euler="5 3 40"/>',
+    "strip": '<geom type="plane" size="0 .2 1" euler="5 3 40"/>',
     "sphere": '<geom type="sphere" size=".3" pos=".1 .1 0"/>',
     "ellipsoid": '<geom type="ellipsoid" size=".1 .3 .2" euler="20 30 40"/>',
     "capsule": '<geom type="capsule" size=".15 .3" euler="20 60 40"/>',

@@ -13,7 +13,16 @@ from hypothesis import given, strategies as st
 from purerl.core.env import State
 from purerl.core.parts import WHOLE, as_one_part
 from purerl.core.records import count_as_int
-from purerl.ppo import algorithm, batches, evaluation, learner, networks, optimizer, running_moments
+from purerl.ppo import (
+    algorithm,
+    batches,
+    episodes,
+    evaluation,
+    learner,
+    networks,
+    optimizer,
+    running_moments,
+)
 from purerl.ppo.episodes import time_limits
 from purerl.ppo.rollout import rollout
 from tests import quick
@@ -152,6 +161,8 @@ def test_training_episodes_have_limits_from_the_shortest_to_whole_ones_each_envi
     for none in (0, LENGTH, LENGTH + 1):  # a planner, too, shortens episodes and asks no one
         whole = dataclasses.replace(config, shortest_episode=none)
         np.testing.assert_array_equal(time_limits(whole, part.env_ids), [LENGTH, LENGTH])
+    alone = dataclasses.replace(config, num_envs=1)
+    np.testing.assert_array_equal(time_limits(alone, jnp.array([0])), [LENGTH])
 
 
 def test_every_environment_and_update_has_a_fresh_start():
@@ -327,6 +338,42 @@ def test_a_truncated_step_keeps_its_value_where_the_next_start_is_lost():
     np.testing.assert_array_equal(lost.next_value[first[at], at], sound.next_value[first[at], at])
 
 
+class Fragile(BadStarts):
+    """Lost by every fourth action, more or less, also from a start."""
+
+    def step(self, state, action):
+        moved = super().step(state, action)
+        x = jnp.where(action[0] > 0.5, jnp.nan, moved.physics["x"])
+        return self.state(x, moved.reward, state.task["start"])
+
+
+def test_what_follows_a_step_is_the_next_one_that_is_taught():
+    """However many are lost in a row. None is, if the start that is left is no number: then 0."""
+    _, network, state = setup()
+    after, found, _ = ROLLOUT(CONFIG, Fragile(), network, state)
+    valid, value = np.asarray(found.valid), np.asarray(found.value)
+    last = episodes.act(network, after, after.env_state, after.memory)[0].value
+    last, in_a_row = np.nan_to_num(np.asarray(last)), 0
+    assert valid[0].any() and np.isfinite(found.next_value).all() and (last == 0).any()
+    for t, b in np.argwhere(valid & ~np.asarray(found.done)):
+        taught = t + 1 + np.flatnonzero(valid[t + 1 :, b])
+        right = value[taught[0], b] if len(taught) else last[b]
+        np.testing.assert_allclose(found.next_value[t, b], right, rtol=1e-5)
+        in_a_row += not valid[t + 1 : t + 3, b].any()
+    assert in_a_row > 2
+
+
+def test_an_episode_that_is_lost_counts_nothing():
+    """A success that is counted first and taken back at the end would be one."""
+    env, network, state = setup(env=Walk(cliff=3.0))
+    key = jax.random.key(1)
+    found = evaluation.evaluate_policy(env, network, state, key, 8, 30, False)
+    lost = np.asarray(found["lost"], bool)
+    assert 0 < lost.sum() < 8
+    moves = np.asarray(found["moves_count"])
+    assert (moves[lost] == 0).all() and (moves[~lost] == 30).all()
+
+
 def test_a_lost_sample_has_no_weight_in_the_update():
     """Whatever stands in the lost rows, the gradient is the same."""
     env, network, state = setup()
@@ -492,6 +539,9 @@ def test_adaptive_learning_rate(kl, factor):
     np.testing.assert_allclose(rate, 1e-3 * factor, rtol=1e-6)
     unmoved = optimizer.next_rate(config, jnp.asarray(1e-3), jnp.asarray(kl), jnp.asarray(False))
     np.testing.assert_allclose(unmoved, 1e-3)
+    for outside, moves in ((2e-6, max(factor, 1.0)), (0.1, min(factor, 1.0))):  # towards the range
+        rate = optimizer.next_rate(config, jnp.asarray(outside), jnp.asarray(kl), jnp.asarray(True))
+        np.testing.assert_allclose(rate, outside * moves, rtol=1e-6)
 
 
 def test_reward_scaling_by_the_running_return():
