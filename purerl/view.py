@@ -9,7 +9,6 @@ change the numbers of the environment's options, which begin as they are given:
 A run's folder is only read, and may be training meanwhile.
 """
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -38,8 +37,7 @@ class ViewOptions(PlanOptions):
 def command(words: Sequence[str]) -> None:
     """Opens the page and plays until Ctrl-C."""
     found = find(words, PROG, policies=True)
-    prog = f"{PROG} {shlex.quote(found.name)}"
-    chosen, options = settings_of(found, words[1:], prog, ViewOptions)
+    chosen, options = settings_of(found, words[1:], PROG, ViewOptions)
     command_errors.check_installed("viser", "view")  # its help needs no window
     from purerl.tune.view import opening
     from purerl.tune.view.loop import check_port, play

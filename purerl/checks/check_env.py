@@ -141,6 +141,8 @@ def check_fields(state: Any) -> None:
     scalars = {name: (getattr(state, name), dtype) for name, dtype in rules.items()}
     if not isinstance(state.metrics, dict):
         raise EnvError(f"metrics is a {type(state.metrics).__name__}: it must be a dict.")
+    if numbers := [name for name in state.metrics if not isinstance(name, str)]:
+        raise EnvError(f"metrics has the name {numbers[0]!r}: names are texts.")
     for name in sorted(RESERVED & state.metrics.keys()):
         raise EnvError(f"metrics has {name!r}, a name of the trainer's: give the metric another.")
     scalars |= {f"metrics[{name!r}]": (x, jnp.float32) for name, x in state.metrics.items()}

@@ -41,6 +41,7 @@ def examine(network: Network, observation: PyTree) -> Iterator[Finding]:
         yield error("outputs", "scale is not above 0 everywhere: take softplus or exp of it.")
         return
     yield ok("outputs", f"value {np.min(value):.2g} to {np.max(value):.2g}, finite")
+    yield from _check_batch(network, _moved(params), inputs, memory)
     yield from _check_memory(memory, following)
     yield from _check_inputs(*moved[:2])
     rates = network.scale(jax.tree.map(jnp.ones_like, params))
@@ -55,6 +56,19 @@ def _moved(params: PyTree) -> PyTree:
     """
     noise = optax.tree.random_like(jax.random.key(0), params)
     return jax.tree.map(lambda x, step: x + STEP * step, params, noise)
+
+
+def _check_batch(network: Network, *given: PyTree) -> Iterator[Finding]:
+    """Is the answer to an observation that to it alone? `given`: parameters, inputs, memory."""
+
+    def first(params: PyTree, *batch: PyTree) -> np.ndarray:
+        output, _ = jax.jit(network.apply)(params, *batch)
+        return np.hstack([np.ravel(x[0]) for x in (*output.distribution, output.value)])
+
+    whole, alone = first(*given), first(given[0], *jax.tree.map(lambda x: x[:1], given[1:]))
+    if (apart := np.abs(whole - alone).max()) > 1e-3 * (1.0 + np.abs(alone).max()):
+        yield error("batch", f"alone an observation has another answer than among others, by "
+                    f"{apart:.2g}: compute each row of a batch by itself.")  # fmt: skip
 
 
 def _normalize(x: Array) -> Array:

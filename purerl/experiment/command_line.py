@@ -201,13 +201,15 @@ def _of_annotated_kind(info: Any) -> Any:
 
 
 def _entries(option: str, value: Any) -> str:
-    """Returns which entries a dict of the settings `value` has, where an option names another."""
+    """Returns which entries a dict of the settings has, where an option names another, or none."""
     path = option[2:].replace("-", "_").split(".")
     for i, word in enumerate(path):
         if isinstance(value, dict) and word not in value:
             names = f"{'.'.join(path[:i])} names {', '.join(value) or 'none'}"
             return f"{names}: name others in the experiment's file."
         value = value[word] if isinstance(value, dict) else getattr(value, word, None)
+    if isinstance(value, dict) and value:
+        return f"Give its entries by name: {', '.join(f'{option}.{name}' for name in value)}."
     return ""
 
 
@@ -219,12 +221,13 @@ def _one_line(text: str, names: list[str], base: Any) -> str:
     if unknown:
         if unknown[1] in ("True", "False"):
             return "A switch takes no value: give its option alone, or leave it out."
-        if unknown[1] in names:  # a bool that is true: what turns it off is its only option
+        entries = _entries(unknown[1], base)
+        if unknown[1] in names and not entries:
             group, dot, name = unknown[1][2:].rpartition(".")
             return f"{unknown[1]} takes no value; --{group}{dot}no-{name} turns it off."
         if not unknown[1].startswith("-"):
             return f"{unknown[1]!r} follows no option; write one before it, as in --name x."
-        hint = _entries(unknown[1], base) or other_trainers.suggest(unknown[1], names)
+        hint = entries or other_trainers.suggest(unknown[1], names)
         return f"There is no option {unknown[1]}. {hint}".strip()
     titles = "Value error|Missing argument|Invalid choice|Parsing error|Required options"
     plain = re.sub(rf"^({titles}) ", "", plain)

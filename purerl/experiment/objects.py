@@ -2,6 +2,7 @@
 
 import contextlib
 import inspect
+import math
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -159,6 +160,13 @@ def _check_weights(weights: dict[str, Any], named: dict[str, Any]) -> None:
             f"The network returns the losses: {losses}; ppo.auxiliary weighs: {weighed}. Give each "
             "loss a weight, which may be 0, and take away those of no loss."
         )
+    for name, weight in weights.items():
+        *ends, steps = weight if isinstance(weight, list | tuple) else (weight, 1)
+        if not (all(map(math.isfinite, ends)) and 1 <= steps < math.inf):
+            raise ValueError(
+                f"ppo.auxiliary.{name} is {weight}: give a finite number, or the first, the last "
+                "and in how many steps, 1 or more."
+            )
 
 
 def _check_network(network: Network, observation: PyTree, action_size: int) -> tuple[Any, Any]:

@@ -161,6 +161,7 @@ def select(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
     """
 
     def one(a: Array, b: Array) -> Array:
-        return jnp.where(jnp.expand_dims(condition, tuple(range(1, b.ndim))), a, b)
+        # Unlike `where` it refuses other shapes and dtypes, as of a `step` unlike its `reset`.
+        return jax.lax.select(jax.lax.broadcast_in_dim(condition, b.shape, (0,)), a, b)
 
     return jax.tree.map(one, yes, no)

@@ -3,6 +3,7 @@
 Pure functions of what the folder held (`folder.Folder`) and of what would be written now.
 """
 
+import glob
 import uuid
 from collections.abc import Sequence
 from pathlib import Path
@@ -43,6 +44,8 @@ def check_new_or_resume(
     """
     if resume is True and not any(folder.exists for folder in folders):
         where = folders[0].path
+        if several := sorted(where.parent.glob(f"{glob.escape(where.name)}-seed*")):
+            raise UserError(f"There is no run {where}, but {several[0].name}: give --num-seeds.")
         raise UserError(f"There is no run {where} to resume; leave out --resume to start it.")
     for folder, chosen in zip(folders, experiments, strict=True):
         _check_usable(folder, chosen, resume)
@@ -159,6 +162,8 @@ def cure(found: list[str]) -> str:
         return "Put back the data, of a file or another run, that the environment or network holds"
     if all(line.startswith(("source.", f"{CODE}: ", "arrays")) for line in found):
         return "Put back what was edited"
+    if any(line.startswith(("source.", f"{CODE}: ")) for line in found):
+        return "Put back what was edited, or give every setting it was begun with"
     if all(line.startswith("model: ") for line in found):  # no setting and no code has made it so
         return "Put back what was edited of the MuJoCo model, the MJCF or a file that it reads"
     of_command = any(line.startswith(("settings.", "schedule.")) for line in found)

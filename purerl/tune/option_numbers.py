@@ -40,6 +40,8 @@ def replaced(options: Any, values: Mapping[Place, Any]) -> Any:
     if isinstance(options, tuple):
         parts = [replaced(part, inside.get(i, {})) for i, part in enumerate(options)]
         return type(options)(*parts) if hasattr(options, "_fields") else tuple(parts)
+    if isinstance(options, dict):
+        return {name: replaced(part, inside.get(name, {})) for name, part in options.items()}
     changed = {str(n): replaced(getattr(options, str(n)), part) for n, part in inside.items()}
     return dataclasses.replace(options, **changed) if changed else options
 

@@ -428,6 +428,7 @@ class Flaw:
     idle: tuple = ()
     nan: bool = False
     zeros: bool = False  # in the last layers: until they are trained, nothing before them is
+    mixes: bool = False  # a batch
     root: bool = False  # of a parameter that begins at 0, where its slope is infinite
 
 
@@ -448,6 +449,7 @@ class Small(nn.Module):
             self.param(name, nn.initializers.ones, (2,))
         if self.flaw.root:
             value += jnp.sqrt(jnp.abs(self.param("root", nn.initializers.zeros, ())))
+        loc = loc - loc.mean(0) if self.flaw.mixes else loc
         value = jnp.log(-jnp.exp(value)) if self.flaw.nan else value
         scale = jnp.exp(self.param("scale", nn.initializers.zeros, (1,)))
         return PolicyOutput(Normal(loc, jnp.broadcast_to(scale, loc.shape)), value)
@@ -468,6 +470,7 @@ class Small(nn.Module):
         (Flaw(nan=True), "outputs", "error: value is not finite"),
         (Flaw(nan=True, policy_reads=()), "outputs", "error: loc, value are not finite"),
         (Flaw(zeros=True), None, ""),
+        (Flaw(mixes=True), "batch", "error: alone an observation has another answer"),
         (Flaw(root=True), "gradients", "error: of params/root are not finite"),
     ],
 )

@@ -199,6 +199,7 @@ def test_a_run_on_c_imports_no_other_engine():
         (["vmapped_seeds: {'first': 1, 'number': 3} -> (absent)"], "--num-seeds and --seed"),
         (["schedule.log_every: 1 -> 2", "settings.ppo.num_steps: 9 -> 99"], "go_on.md"),
         (["settings.ppo.num_steps: 9 -> 99"], "Leave out what differs; to train longer, copy"),
+        (["settings.ppo.num_steps: 9 -> 99", "source.mine: ab -> cd"], "edited, or give every"),
         (["model: ab -> cd"], "Put back what was edited of the MuJoCo model"),
         (["model: ab -> cd", "settings.env.mass: 1.0 -> 2.0"], "Leave out what differs"),
         (

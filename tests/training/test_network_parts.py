@@ -143,6 +143,9 @@ def test_each_vmapped_seed_begins_with_the_part():
          ": name others in the experiment's file."),
         (["--ppo.auxiliary.code-kl", "1", "2"], "--ppo.auxiliary.code-kl is '1', '2'; it must be "
          "FLOAT or FLOAT FLOAT INT."),
+        (["--ppo.auxiliary", "0.1"], "no option --ppo.auxiliary. Give its entries by name: "
+         "--ppo.auxiliary.code_kl, "),
+        (["--ppo.auxiliary.code-kl", "0", "1", "-5"], "ppo.auxiliary.code_kl is (0.0, 1.0, -5): "),
         (["--parts.decoder.run", "nowhere"], "nowhere"),
         (["--parts.decoder.reads", "eyes"], "There is no entry of the observation 'eyes'. There "
          "are: policy."),

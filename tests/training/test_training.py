@@ -201,6 +201,12 @@ def test_a_mistake_is_one_line_and_nothing_is_written(tmp_path, changes, options
     assert not list(tmp_path.iterdir())
 
 
+def test_a_group_is_resumed_with_its_number_of_seeds(tmp_path):
+    (tmp_path / "toy_experiment" / "kk-seed2").mkdir(parents=True)
+    with pytest.raises(purerl.UserError, match="no run .*/kk, but kk-seed2: give --num-seeds"):
+        purerl.train(str(TOY), runs=tmp_path, name="kk", resume=True)
+
+
 @dataclasses.dataclass(frozen=True)
 class Inner:
     ratio: float = 0.5

@@ -80,16 +80,15 @@ def read(words: Sequence[str], prog: str) -> tuple[Problem, Problem | None, Plan
         place = words.index(AGAINST)
         words, after = words[:place], words[place + 1 :]
     found = subject.find(words, prog)
-    prog = f"{prog} {shlex.quote(found.name)}"
     chosen, options = subject.chosen(found, words[1:], prog, PlanCommandOptions)
     if found.run is None and options.no_policy:
         raise UserError(f"{found.name} is an experiment: --no-policy is for a run's folder.")
     first = _problem(found, chosen, options)
     if after is None:
         return first, None, options
-    _check_after(after, prog)
+    _check_after(after, f"{prog} {shlex.quote(found.name)}")
     begin = found._replace(source=found.source._replace(experiment=chosen))
-    other, _ = subject.chosen(begin, after, f"{prog} {AGAINST}", Nothing, ("env",))
+    other, _ = subject.chosen(begin, after, prog, Nothing, ("env",))
     if other.env == chosen.env:
         raise UserError(
             f"The settings after {AGAINST} are those before it: give what differs "

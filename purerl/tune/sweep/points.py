@@ -1,11 +1,10 @@
 """The points of a sweep: settings as words of `python -m purerl.run`, checked before it begins."""
 
 import dataclasses
-import functools
 import shlex
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, get_args
 
 import tyro
 
@@ -88,22 +87,28 @@ def setting(base: Base, name: str) -> Any:
 def _names(value: Any, path: str = "") -> dict[str, Any]:
     """Returns the settings of an experiment, `ppo.learning-rate` -> value."""
     found: dict[str, Any] = {}
-    for name, inner in settings_json.settings_of(value).items():
+    own = value if isinstance(value, dict) else settings_json.settings_of(value)
+    for name, inner in own.items():
         name = path + name.replace("_", "-")
-        deeper = settings_json.has_settings(inner)
+        deeper = settings_json.has_settings(inner) or (isinstance(inner, dict) and inner)
         found |= _names(inner, f"{name}.") if deeper else {name: inner}
     return found
 
 
 def read_value(base: Base, name: str, text: str) -> Any:
     """Returns a setting's value of the type that it has; UserError if it is of another."""
-    *path, last = name.replace("-", "_").split(".")
-    owner: Any = functools.reduce(getattr, path, base.chosen)
-    kind = kinds.hints(type(owner)).get(last, type(getattr(owner, last)))
+    value: Any = base.chosen
+    kind: Any = Any
+    for word in name.replace("-", "_").split("."):
+        if isinstance(value, dict):
+            kind, value = (get_args(kind) or (Any,))[-1], value[word]
+        else:
+            kind, value = kinds.hints(type(value)).get(word, Any), getattr(value, word)
+    kind = type(value) if kind is Any else kind
     # A class with this setting alone: rules that join several settings come later, in `check`.
     one: Any = Annotated[kind, tyro.conf.arg(name=name)]
     alone = dataclasses.make_dataclass("Alone", [("value", one)], frozen=True)
-    words = [_bool_word(name, text)] if isinstance(getattr(owner, last), bool) else text.split()
+    words = [_bool_word(name, text)] if isinstance(value, bool) else text.split()
     prog = f"python -m purerl.run {shlex.quote(base.experiment)}"
     return parse(alone, [f"--{name}", *words], prog, None, WORDS).value
 

@@ -61,6 +61,16 @@ def test_a_file_says_the_same(capsys, place):
     assert "sweeps/other" in dry(capsys, "sweep.toml", "--name", "other")[0]
 
 
+def test_an_entry_of_a_dict_is_a_setting(capsys, place):
+    coded = TOY.with_name("coded_experiment.py")
+    commands = dry(capsys, str(coded), "--grid", "ppo.auxiliary.sparsity=0.1,0 0.1 99")
+    assert [words[1 : words.index("--runs")] for words in commands] == [
+        ["--ppo.auxiliary.sparsity", "0.1"], ["--ppo.auxiliary.sparsity", "0", "0.1", "99"]
+    ]  # fmt: skip
+    assert sweep.main([str(coded), "--grid", "ppo.auxiliary.kl=1"]) == USAGE
+    assert "There is no setting 'ppo.auxiliary.kl'" in capsys.readouterr().err
+
+
 MISTAKES = [
     (["--grid", "ppo.lr=1,2"], "There is no setting 'ppo.lr'. Did you mean ppo.learning-rate?"),
     (["--grid", "ppo.learning-rate=1e-3,fast"], "--ppo.learning-rate is 'fast'; it must be a num"),
