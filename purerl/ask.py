@@ -53,6 +53,8 @@ def command(words: Sequence[str]) -> None:
     experiment, options = subject.chosen(first, words, PROG, AskOptions)
     check_least(options, UserError, episodes=1)
     asked = asking.cases(first.source, experiment, options, f"{PROG} {first.name}")
+    if options.out.suffix == ".png":
+        raise UserError(f"{options.out} is the picture's name: give the table's, such as ask.csv.")
     for path in (options.out, options.out.with_suffix(".png")):
         files.check_new(path)
     answers = list(asking.ask(runs, asked, options))

@@ -78,7 +78,7 @@ def draw(clip: Any, model: Any) -> None:
     still = [np.tile(x, (length, 1, 1, 1)) for x in (data.mocap_pos, data.mocap_quat)]
     arrays: Any = [np.asarray(clip.qpos).swapaxes(0, 1), *still, {}, ()]
     rest: Any = np.ones((length, 1), bool), np.zeros(1), np.full(1, length), np.ones(1, bool)
-    path = Path(f"{Path(clip.names[0]).stem}.mp4")
+    path = Path(f"{Path(clip.names[0]).name}.mp4")
     with renderer.Renderer(model, 640, 480) as drawing:
         shown = episode_pictures.Recording(Picture(*arrays), *rest)
         video.draw(path, drawing, shown, 1.0 / clip.rate)

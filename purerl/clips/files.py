@@ -103,7 +103,10 @@ def _read_named(path: Path, file: Any) -> Motion:
     lengths = get("metadata/clip_lengths", 1, clips[:1], np.full(*clips))
     positions = get("all_clips/body_positions", 4, clips, np.zeros((*clips, 0, 3)))
     bodies = get("metadata/body_names", 1, positions.shape[2:3]) if positions.size else ()
-    rate = float(file["all_clips"].attrs.get("rate", 0.0))
+    try:
+        rate = float(said := file["all_clips"].attrs.get("rate", 0.0))
+    except (TypeError, ValueError):
+        raise UserError(f"{path}: rate is {said!r}; it must be a number [Hz].") from None
     return Motion(columns, values, lengths, names, rate, bodies, positions)
 
 

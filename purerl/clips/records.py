@@ -110,10 +110,11 @@ def cut(clips: Clips, name: str, start: float = 0.0, end: float | None = None) -
         raise UserError(unknown_name("clip", name, clips.names))
     number, rate = clips.names.index(name), clips.rate
     last = int(clips.lengths[number]) - 1
-    first, end_frame = round(start * rate), last if end is None else round(end * rate)
-    if not 0 <= first <= end_frame <= last:
+    end = last / rate if end is None else end
+    if not 0.0 <= start <= end <= (last + 0.5) / rate:
         whole = f"Clip {name!r} lasts from 0 to {last / rate:g} s"
-        raise UserError(f"{whole}: {start:g} to {end or last / rate:g} s is no part of it.")
+        raise UserError(f"{whole}: {start:g} to {end:g} s is no part of it.")
+    first, end_frame = round(start * rate), min(round(end * rate), last)
     qpos, qvel = (x[number : number + 1, first : end_frame + 1] for x in clips[:2])
     return Clips(qpos, qvel, jnp.array([qpos.shape[1]], jnp.int32), (name,), rate)
 

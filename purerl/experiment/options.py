@@ -83,10 +83,14 @@ class Lesion:
 
     def __post_init__(self) -> None:
         """Checks the rules."""
-        most, end = (1.0 if self.kind == "silence" else math.inf), self.end or math.inf
+        most = 1.0 if self.kind == "silence" else math.inf
+        end = math.inf if self.end is None else self.end
         rules = {
             "units": (re.fullmatch(UNITS, self.units), "all, or numbers such as 0-15,20"),
-            "strength": (self.kind == "clamp" or 0.0 <= self.strength <= most, f"0 to {most:g}"),
+            "strength": (
+                math.isfinite(x := self.strength) and (self.kind == "clamp" or 0.0 <= x <= most),
+                f"0 to {most:g}",
+            ),
             "share": (0.0 <= self.share <= 1.0, "from 0 to 1"),
             "begin": (0 <= self.begin < end, f"0 or more, and below end, {self.end}"),
         }

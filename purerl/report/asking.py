@@ -55,10 +55,9 @@ def cases(source: Source, experiment: Experiment, options: Any, prog: str) -> li
     if not values:
         raise UserError(f"vary is {name}; give values too, as in --vary {name} 0.1 0.2.")
     found: list[Case] = []
-    for value in dict.fromkeys(values):
+    for at, value in {float(x) if NUMBER.fullmatch(x) else x: x for x in values}.items():
         # One number is both ends of a range.
         times = len(held[name]) if isinstance(held[name], list) and name[:4] == "env." else 1
-        at = float(value) if NUMBER.fullmatch(value) else value
         words = [f"--{name.replace('_', '-')}", *[value] * times] if name else []
         over = lambda _, over: over(experiment, **vars(options))  # noqa: E731
         read = from_command_line(source, words, prog, WORDS, type(options), ("env",), over)
@@ -166,12 +165,13 @@ def summarize(answers: Sequence[Answer], outcome: str) -> list[dict[str, Any]]:
 
     Each has what is in `COLUMNS`; its interval is one over the run's episodes, or over the runs.
     """
-    rows, means = [], dict[tuple, list[float]]()
+    rows, means = [], dict[tuple, dict[str, float]]()  # a run may have one condition twice
     for about, found in answers:
         x = found[outcome].astype(float)
         rows.append(about | {"n": len(x), "mean": float(x.mean()), "interval": episode_interval(x)})
-        means.setdefault((about["lesion"], about["value"]), []).append(float(x.mean()))
-    for (lesion, value), each in means.items():
+        means.setdefault((about["lesion"], about["value"]), {})[about["run"]] = float(x.mean())
+    for (lesion, value), of_runs in means.items():
+        each = list(of_runs.values())
         about = {"run": f"{len(each)} runs", "lesion": lesion, "value": value, "n": len(each)}
         mean = {"mean": float(np.mean(each)), "interval": mean_interval(np.array(each))}
         rows += [about | mean] * (len(each) > 1)

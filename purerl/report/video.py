@@ -54,7 +54,7 @@ def make_video(
     env = acting[0].env
     # The files are named after the update, and after what is not the default.
     words = [f"{run.update:012d}", *changes]
-    name = "_".join(re.sub(r"(: .* -> |[^\w.-])+", "-", word).strip("-") for word in words)
+    name = "_".join(re.sub(r"(: .* -> |[^\w.,-])+", "-", word).strip("-") for word in words)
     path = videos_of(run.folder) / f"{name}.mp4"
     with renderer_of(env, size, options.camera) as renderer:
         recording = _play(acting, options.episodes, options.seconds, options.seed)

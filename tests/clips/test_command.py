@@ -72,6 +72,8 @@ def test_a_file_without_a_rate_is_written_with_it(capsys, tmp_path, monkeypatch)
         (["none.h5"], "none.h5 cannot be read: No such file or directory (in /"),
         (["FILE", "--rate", "100"], "is of 50 Hz, not 100: leave the rate out."),
         (["FILE", *BODY, "--cut", "Roll_1", "0.5", "2"], "0.5 to 2 s is no part of it."),
+        (["FILE", *BODY, "--cut", "Roll_1", "nan", "1"], "nan to 1 s is no part of it."),
+        (["FILE", *BODY, "--cut", "Roll_1", "0", "inf"], "0 to inf s is no part of it."),
         (["FILE", *BODY, "--cut", "Rol_1", "0.5", "2"], "no clip 'Rol_1'. Did you mean 'Roll_1'"),
     ],
 )

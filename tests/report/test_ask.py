@@ -200,6 +200,8 @@ def test_intervals_are_of_episodes_and_of_the_means_of_runs():
     assert alone["n"] == 6
     four = [row for row in asking.summarize(runs[:4], "landed") if row["run"] == "4 runs"]
     assert four[0]["interval"] is None
+    # The same condition twice makes no second run: a lesion of no unit, or a number given twice.
+    assert len(asking.summarize([*runs[:1], *runs[:1]], "landed")) == 2
 
 
 def test_a_share_of_all_is_not_sure():
@@ -227,7 +229,7 @@ def test_one_number_is_both_ends_of_a_range_and_a_lesion_comes_after_none():
     assert [(value, x.env.gap_length, lesion.share) for value, x, lesion in found] == [
         (value, (value, value), share) for value in (0.3, 0.4) for share in (0.0, 1.0)
     ]
-    shares = dataclasses.replace(options, vary=("lesion.share", "0", "0.5"))
+    shares = dataclasses.replace(options, vary=("lesion.share", "0", "0.5", "0.50"))
     found = asking.cases(source, run.experiment, shares, "ask")
     assert [lesion.share for _, _, lesion in found] == [0.0, 0.5]
 
@@ -263,7 +265,16 @@ def test_its_rows_are_an_evaluations_and_a_lesions(run, tmp_path, capsys, monkey
         (["--lesion.layer", FIRST, "--lesion.begin", "9", "--lesion.end", "9"], "below end, 9."),
         (["--lesion.layer", FIRST, "--vary", "lesion.share", "2"], "share is 2.0; it must be"),
         (["--lesion.layer", FIRST, "--lesion.strength", "1.5"], "strength is 1.5; it must be"),
+        (
+            ["--lesion.layer", FIRST, "--lesion.end", "0"],
+            "begin is 0; it must be 0 or more, and be",
+        ),
+        (
+            ["--lesion.layer", FIRST, "--lesion.kind", "clamp", "--lesion.strength", "nan"],
+            "strength is nan; it must be",
+        ),
         (["--out", "/nowhere/a.csv"], "/nowhere/a.csv cannot be written"),
+        (["--out", "a.png"], "a.png is the picture's name: give the table's"),
         (["ant_gaps"], "The runs differ in experiment"),
     ],
 )
