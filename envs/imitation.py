@@ -196,11 +196,10 @@ class Imitation:
 
 def record(parts: Parts, held: clips.Clips) -> Recording:
     """Returns clips, a frame for each control step, as an environment holds them."""
-    places = [clips.kinematics(parts.model, np.asarray(track)) for track in held.qpos]
-    # By number: some have no name. `kinematics` has the whole body's parts in their order.
-    own = np.flatnonzero(parts.model.body_rootid == parts.model.body_rootid[parts.torso])
-    numbers = np.searchsorted(own, (parts.torso, *parts.bodies))
-    where = jnp.asarray(np.stack([place[:, numbers] for _, place in places]), jnp.float32)
+    places = [clips.kinematics(parts.model, np.asarray(track))[1] for track in held.qpos]
+    # By number: some have no name.
+    numbers = np.searchsorted(clips.own_bodies(parts.model), (parts.torso, *parts.bodies))
+    where = jnp.asarray(np.stack([place[:, numbers] for place in places]), jnp.float32)
     return Recording(held.qpos, held.qvel, where[:, :, 0], where[:, :, 1:, :3], held.lengths)
 
 

@@ -1,5 +1,11 @@
 # The public names, each once; `__init__.py` reads this list.
-from purerl.clips.body import bare as bare, fit as fit, kinematics as kinematics, pack as pack
+from purerl.clips.body import (
+    bare as bare,
+    fit as fit,
+    kinematics as kinematics,
+    own_bodies as own_bodies,
+    pack as pack,
+)
 from purerl.clips.files import read as read, write as write
 from purerl.clips.records import (
     Clips as Clips,

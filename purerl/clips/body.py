@@ -169,12 +169,17 @@ def posed(model: mujoco.MjModel, qpos: np.ndarray) -> Iterator[mujoco.MjData]:
         yield data
 
 
+def own_bodies(model: mujoco.MjModel) -> np.ndarray:
+    """Returns the numbers of the body's parts, in the order in which `kinematics` has them."""
+    return np.flatnonzero(model.body_rootid == root_body(model))
+
+
 def kinematics(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[list[str], np.ndarray]:
     """Returns the bare names of the body's parts, and of each frame of a track where they are.
 
     The latter is [L, B, 7]: positions [m], then quaternions.
     """
-    own = np.flatnonzero(model.body_rootid == root_body(model))
+    own = own_bodies(model)
     found = [np.hstack([data.xpos[own], data.xquat[own]]) for data in posed(model, qpos)]
     return [bare(model.body(i).name) for i in own], np.array(found)
 

@@ -111,11 +111,11 @@ def cut(clips: Clips, name: str, start: float = 0.0, end: float | None = None) -
     number, rate = clips.names.index(name), clips.rate
     last = int(clips.lengths[number]) - 1
     end = last / rate if end is None else end
-    if not 0.0 <= start <= end <= (last + 0.5) / rate:
+    first, end_frame = np.round([start * rate, end * rate])
+    if not 0 <= first <= end_frame <= last:
         whole = f"Clip {name!r} lasts from 0 to {last / rate:g} s"
         raise UserError(f"{whole}: {start:g} to {end:g} s is no part of it.")
-    first, end_frame = round(start * rate), min(round(end * rate), last)
-    qpos, qvel = (x[number : number + 1, first : end_frame + 1] for x in clips[:2])
+    qpos, qvel = (x[number : number + 1, int(first) : int(end_frame) + 1] for x in clips[:2])
     return Clips(qpos, qvel, jnp.array([qpos.shape[1]], jnp.int32), (name,), rate)
 
 

@@ -162,11 +162,11 @@ def cure(found: list[str]) -> str:
         return "Put back the data, of a file or another run, that the environment or network holds"
     if all(line.startswith(("source.", f"{CODE}: ", "arrays")) for line in found):
         return "Put back what was edited"
-    if any(line.startswith(("source.", f"{CODE}: ")) for line in found):
-        return "Put back what was edited, or give every setting it was begun with"
     if all(line.startswith("model: ") for line in found):  # no setting and no code has made it so
         return "Put back what was edited of the MuJoCo model, the MJCF or a file that it reads"
     of_command = any(line.startswith(("settings.", "schedule.")) for line in found)
+    if of_command and any(line.startswith(("source.", f"{CODE}: ")) for line in found):
+        return "Put back what was edited, or give every setting it was begun with"
     given = "Leave out what differs" if of_command else "Give the command it was begun with"
     if any(line.startswith("settings.ppo.num_steps") for line in found):
         return f"{given}; to train longer, copy the run first (docs/howto/go_on.md)"
